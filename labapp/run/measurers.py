@@ -244,9 +244,9 @@ class LineFollower:
             time_s = np.array([np.nan if one.time_s is None else one.time_s for one in seen])
             step = float(np.median(np.diff(time_s))) if len(seen) > 1 else 0.0
             rate = 1 / step if step > 0 else None
-            film = track_line((one.image for one in seen), rate, tracker, self._at(time_s))
-            pulses = film.pulses
-            followed = zip(film.lines, pulses.on.tolist(), pulses.probability.tolist(), strict=True)
+            images = (one.image for one in seen)
+            pulses, tracked = track_line(images, rate, tracker, self._at(time_s))
+            followed = zip(tracked, pulses.on.tolist(), pulses.probability.tolist(), strict=True)
             for number, frame in begun:
                 if isinstance(frame, FrameResult):
                     yield frame

@@ -18,7 +18,7 @@ from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
 from labapp.core.matching.row_shape import ALLOWED, match_row_shapes
 from labapp.core.schemes.irs import Algorithm, IrsSettings, estimates
 from labapp.core.schemes.slopes import Estimate, ReflectedRays, reflected_rays
-from labapp.core.surface.measures import inside_points, reflection_scale
+from labapp.core.surface.measures import inside_points
 from labapp.core.values import CannotMeasure
 from labapp.studies.tables import Cell, Table
 
@@ -94,10 +94,10 @@ def comparison_tables(match: Match, rig: Rig) -> tuple[Table, Table]:
             settings = IrsSettings(algorithm=algorithm)
             try:
                 rays = reflected_rays(turned, rig)
-                found = dict(estimates(turned, rig, rays, settings))
+                found = dict(estimates(turned, rays, settings))
             except CannotMeasure:
                 rays, found = None, {}
-            errors = {h: _errors(turned, rig, rays, found[h]) for h in found if rays is not None}
+            errors = {h: _errors(turned, rays, found[h]) for h in found if rays is not None}
             nothing: tuple[Cell, ...] = (None,) * len(COLUMNS)
             if algorithm == "opa":
                 one += [(orientation, h, *errors.get(h, nothing)) for h in settings.base_heights_mm]
@@ -119,11 +119,11 @@ def comparison_tables(match: Match, rig: Rig) -> tuple[Table, Table]:
     )
 
 
-def _errors(match: Match, rig: Rig, rays: ReflectedRays, estimate: Estimate) -> tuple[Cell, ...]:
+def _errors(match: Match, rays: ReflectedRays, estimate: Estimate) -> tuple[Cell, ...]:
     """`COLUMNS` of an estimate (Eq. 6-3 … 6-8)."""
     captured, gradient = rays.plane_mm, estimate.surface.point_gradient
     residual = (rays.reflected(estimate.points_mm, gradient) - captured)[: rays.measured]
-    error = np.hypot(*(residual * reflection_scale(match, rig)).T)
+    error = np.hypot(*(residual * rays.scale).T)
     met = np.isfinite(error)
     parts = error[met], error[met & inside_points(match.ray)]
     return tuple(

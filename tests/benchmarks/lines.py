@@ -20,8 +20,9 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
 from labapp.core.lines.frame import LineFrame, measure_lines
+from labapp.core.lines.pulses import pulse_frequency
 from labapp.core.lines.states import LineSeries, line_changes, line_states
-from labapp.core.lines.track import track_line
+from labapp.core.lines.track import oscillation_frequency, track_line
 from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import Pool, egg
 from tests.line_truth.frames import LineFrame as TrueFrame
@@ -178,12 +179,12 @@ def gmaw(frames: int, seed: int, pictures: Path | None) -> None:
     run = list(gmaw_run(frames, GMAW_RIG, GMAW_VIEW, rng, oscillation_hz=hertz))
     look = GmawLook()
     begin = time.perf_counter()
-    film = track_line((one.image for one in run), look.frame_rate_hz)
+    pulses, lines = track_line((one.image for one in run), look.frame_rate_hz)
     rate = frames / (time.perf_counter() - begin)
     truth = np.array([one.on for one in run])
     off_frames, followed, errors = np.flatnonzero(~truth), 0, []
     for k in off_frames:
-        line = film.lines[k]
+        line = lines[k]
         if line is None:
             continue
         u, v = run[k].line_px[np.argsort(run[k].line_px[:, 0])].T
@@ -197,11 +198,15 @@ def gmaw(frames: int, seed: int, pictures: Path | None) -> None:
                 place = np.rint(3 * np.array(point) + 1).astype(int).tolist()
                 cv2.circle(enlarged, place, 1, (60, 255, 60), -1)
             cv2.imwrite(str(pictures / f"gmaw{k}.png"), enlarged)
+    shifts = [
+        (k / look.frame_rate_hz, one.shift_px) for k, one in enumerate(lines) if one is not None
+    ]
+    oscillation, _ = oscillation_frequency(*np.array(shifts).T)
     print(
-        f"on/off right in {np.mean(film.pulses.on == truth):.2%} of {frames} frames, pulses at"
-        f" {film.pulses.frequency_hz:.2f} Hz (true {look.pulse_hz:g});"
+        f"on/off right in {np.mean(pulses.on == truth):.2%} of {frames} frames, pulses at"
+        f" {pulse_frequency(pulses.on, look.frame_rate_hz):.2f} Hz (true {look.pulse_hz:g});"
         f" line followed in {followed / len(off_frames):.1%} of {len(off_frames)} off-frames,"
-        f" median error {np.median(errors):.2f} px; oscillation {film.frequency_hz:.2f} Hz"
+        f" median error {np.median(errors):.2f} px; oscillation {oscillation:.2f} Hz"
         f" (true {hertz:.2f}); {rate:.0f} frames/s"
     )
 

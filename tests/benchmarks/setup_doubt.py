@@ -94,7 +94,7 @@ def recorded(
         witness = np.where(shown, 1, np.where(reflections.lit | reflections.absent, 0, -1))
         match = MatchedDots(ray, dots, covariance, witness, MISSING)
         try:
-            pool_fit = fit_pool(match, exact, FitSettings(), near, by_uncertain_heights=True)
+            pool_fit = fit_pool(match, exact, FitSettings(), near, weigh_by_height_sigma=True)
         except CannotMeasure as error:
             statuses[error.status] += 1
             near = None

@@ -92,7 +92,7 @@ def test_base_point_is_leftmost_of_the_row_nearest_the_head():
 
 def test_points_are_on_their_rays_and_own_are_is_that_of_step_4():
     match = match_of(egg(6.6, 3.0, 4.0, 0.35))
-    reconstruction = ers.reconstruct(match, RIG)
+    reconstruction = ers.reconstruct(match, RIG, ers.ErsSettings())
     np.testing.assert_array_equal(reconstruction.ray, match.ray)
     rays = reflected_rays(match, RIG)
     direction = rays.direction[: rays.measured]
@@ -233,11 +233,11 @@ def test_random_subsets_of_dots_are_measured_or_rejected(seed, share):
 def test_too_few_dots_are_rejected():
     match = match_of(spherical_cap(6.0, 0.3))
     with pytest.raises(CannotMeasure, match="too-few-dots"):
-        ers.reconstruct(without(match, np.arange(len(match.ray)) >= 8), RIG)
+        ers.reconstruct(without(match, np.arange(len(match.ray)) >= 8), RIG, CIRCLE)
     with pytest.raises(CannotMeasure, match="too-few-dots"):
-        ers.reconstruct(without(match, ~np.isin(match.ray[:, 0], (10, 11))), RIG)
+        ers.reconstruct(without(match, ~np.isin(match.ray[:, 0], (10, 11))), RIG, CIRCLE)
     with pytest.raises(CannotMeasure, match="too-few-dots"):
-        ers.reconstruct(without(match, np.ones(len(match.ray), bool)), RIG)
+        ers.reconstruct(without(match, np.ones(len(match.ray), bool)), RIG, CIRCLE)
 
 
 def test_isolated_row_of_a_single_dot_is_reconstructed():

@@ -84,7 +84,7 @@ def test_28_caps_of_8_3_1() -> None:
         width.append(abs(measures.width_mm / cap.footprint.width_mm - 1))
         length.append(abs(measures.length_mm / cap.footprint.width_mm - 1))
         ers_result = ers.reconstruct(match, OPEN_RIG, ers.ErsSettings(boundary="circle"))
-        error = reflection_errors(ers_result, match, OPEN_RIG).are_mm
+        error = reflection_errors(ers_result, match, OPEN_RIG)["are_mm"]
         ratio.append(error / measures.are_mm)
     assert len(depth) == 28
     assert np.mean(depth) <= 0.01

@@ -19,7 +19,7 @@ from labapp.core.geometry.optics import (
 from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.match import Match
 from labapp.core.schemes import fit
-from labapp.core.surface.level import Level, Rear, Witnesses
+from labapp.core.surface.level import Level, LevelSearch, Rear, Witnesses
 from labapp.core.surface.measures import WITH_SIGMA
 from labapp.core.surface.pool_fit import (
     FitSettings,
@@ -27,7 +27,6 @@ from labapp.core.surface.pool_fit import (
     basis_around,
     fit_pool,
     normal_equations,
-    rounds_with_level,
 )
 from labapp.core.surface.solver import Rounds
 from labapp.core.surface.spline import SplineBasis, SplineSurface
@@ -332,9 +331,7 @@ def test_held_drop_keeps_its_uncertainty(match: Match) -> None:
         rounds = Rounds(
             equations, rays.directions[tuple(at)], np.zeros(basis.count), points, np.inf
         )
-        found[is_free] = rounds_with_level(
-            rounds, witnesses, 3, 0.0, near=held, drop_is_free=is_free
-        )
+        found[is_free] = rounds.run(3, 0.0, search=LevelSearch(witnesses, held, is_free))
     assert (found[False].drop_sigma_mm, found[False].drop_covariance_mm2) == (0.03, -3e-4)
     assert found[False].sigma_mm == 0.02
     assert found[True].drop_sigma_mm < 0.02

@@ -45,7 +45,7 @@ def test_ridge_points_are_on_a_slanted_line():
     share = np.linspace(0, 1, 4000)[:, None]
     frame = drawn((np.array([30.3, 60.7]) + share * np.array([190.0, 61.0]), 60.0), noise=0.2)
     ridges = find_ridges(frame)
-    main = slice(*ridges.starts[:2]) if len(ridges) == 1 else slice(None)
+    main = slice(*ridges.starts[:2]) if len(ridges.starts) == 2 else slice(None)
     points = ridges.image_px[main]
     inner = (points[:, 0] > 45) & (points[:, 0] < 205)
     across = np.array([-61.0, 190.0]) / np.hypot(61.0, 190.0)

@@ -95,7 +95,7 @@ def test_surface_is_nan_outside_and_can_be_raised() -> None:
     outside = np.array([[LOW[0] - 0.01, 0.0], [0.0, HIGH[1] + 0.01]])
     assert np.isnan(surface.height(*outside.T)).all()
     assert np.isnan(surface.gradient(*outside.T)).all()
-    raised = surface.raised(0.7)
+    raised = SplineSurface(BASIS, surface.coefficients + 0.7)
     np.testing.assert_allclose(raised.height(*xy.T), surface.height(*xy.T) + 0.7, atol=1e-12)
     np.testing.assert_allclose(raised.gradient(*xy.T), surface.gradient(*xy.T), atol=1e-12)
     grid = xy[:6].reshape(2, 3, 2)

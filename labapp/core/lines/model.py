@@ -61,14 +61,12 @@ class Curves(ReadOnlyArrays):
     ----------
     fan
         Angles in the fan, shape (f,), rad.
-    point_mm
-        Intersections of the rays with the surface, shape (k, f, 3), mm.
     plane_mm
-        Their landing points on the imaging plane, shape (k, f, 2), mm; NaN if there is none.
+        Landing points of the reflected rays on the imaging plane, shape (k, f, 2), mm; NaN if there
+        is none.
     """
 
     fan: FloatArray
-    point_mm: FloatArray
     plane_mm: FloatArray
 
 
@@ -84,14 +82,11 @@ class Linearized(ReadOnlyArrays):
         Derivatives of the prediction w.r.t. the coefficients, over the same, (n + m, p), mm⁻¹.
     point_mm
         Intersection of the surface with the ray nearest to each point and end, (n + m, 3), mm.
-    fan
-        Angle of that ray in the fan, shape (n + m,), rad.
     """
 
     residual: FloatArray
     jacobian: FloatArray
     point_mm: FloatArray
-    fan: FloatArray
 
 
 @dataclass(frozen=True)
@@ -122,8 +117,7 @@ class LineModel:
         number = np.repeat(self.numbers, self.rays)
         point, direction, slope = self._meet(coefficients, number, np.tile(fan, len(self.numbers)))
         plane = self._land(point, direction, slope)
-        form = len(self.numbers), self.rays
-        return Curves(fan, point.reshape(*form, 3), plane.reshape(*form, 2))
+        return Curves(fan, plane.reshape(len(self.numbers), self.rays, 2))
 
     def residuals(self, coefficients: FloatArray, data: LineData) -> Linearized:
         """Return the equations of points (across the line) and ends (z = 0, or end of the fan)."""
@@ -173,7 +167,7 @@ class LineModel:
         )
         jacobian = np.zeros((len(line), self.basis.count))
         np.put_along_axis(jacobian, cells.splines, local, axis=1)
-        return Linearized(np.nan_to_num(residual, nan=1e3), jacobian, point, fan)
+        return Linearized(np.nan_to_num(residual, nan=1e3), jacobian, point)
 
     def _rates(
         self, coefficients: FloatArray, number: FloatArray, fan: FloatArray

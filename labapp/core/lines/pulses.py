@@ -35,13 +35,10 @@ class Pulses(ReadOnlyArrays):
         Whether the pulse is on, shape (n,).
     probability
         Probability that the pulse is on, shape (n,).
-    frequency_hz
-        Frequency of the pulses; NaN if they are not periodic, or there are none.
     """
 
     on: BoolArray
     probability: FloatArray
-    frequency_hz: float
 
 
 def frame_brightness(frame: Image) -> float:
@@ -70,13 +67,13 @@ def classify_pulses(
     found = [odds for level in given if (odds := _class_odds(level)) is not None]
     if not found:
         off_all = np.zeros(len(given[0]), bool)
-        return Pulses(off_all, np.zeros(len(off_all)), float("nan"))
+        return Pulses(off_all, np.zeros(len(off_all)))
     odds = np.sum(found, axis=0)
     frequency = float("nan") if frame_rate_hz is None else pulse_frequency(odds > 0, frame_rate_hz)
     if np.isfinite(frequency):
         assert frame_rate_hz is not None
         odds = odds + _prior_odds(odds > 0, frequency / frame_rate_hz)
-    return Pulses(odds > 0, 1 / (1 + np.exp(-np.clip(odds, -50, 50))), frequency)
+    return Pulses(odds > 0, 1 / (1 + np.exp(-np.clip(odds, -50, 50))))
 
 
 def _class_odds(level: FloatArray) -> FloatArray | None:
@@ -123,7 +120,7 @@ def _log_odds(light: FloatArray, on: BoolArray) -> FloatArray:
 
 
 def pulse_frequency(on: BoolArray, frame_rate_hz: float) -> float:
-    """Frequency of the pulses, Hz; NaN if they are not periodic.
+    """Frequency of the pulses, Hz; NaN if they are not periodic, or all frames are alike.
 
     Parameters
     ----------
@@ -133,7 +130,7 @@ def pulse_frequency(on: BoolArray, frame_rate_hz: float) -> float:
         Frame rate, Hz.
     """
     count = len(on)
-    if count < 16:
+    if count < 16 or on.all() or not on.any():
         return float("nan")
     wave = (on - on.mean()) * np.hanning(count)
     power = np.abs(np.fft.rfft(wave, 8 * count)) ** 2

@@ -45,6 +45,10 @@ LEAST_CONTRAST = 1.5
 LOWEST_HZ, HIGHEST_HZ = 5.0, 100.0
 """Range of the frequencies of a line's oscillation."""
 
+TERMS_AT_ONCE = 1 << 18
+"""Number of sines, one for each frame and frequency, that are computed at once. SciPy keeps about
+12 arrays of this size; those of all frequencies of a long recording would not fit in memory."""
+
 
 @dataclass(frozen=True)
 class TrackedLine(ReadOnlyArrays):
@@ -177,38 +181,18 @@ def _lit(agrees: BoolArray) -> slice:
     return slice(lit[0], lit[-1] + 1) if len(lit) else slice(None)
 
 
-@dataclass(frozen=True)
-class LineFilm:
-    """Tracking results of one line over a recording.
-
-    Parameters
-    ----------
-    pulses
-        Frames with and without a pulse.
-    lines
-        The line in each frame; None if it is lost or a pulse is on.
-    frequency_hz, strength
-        Frequency of the line's strongest oscillation, and its share of the variance; NaN and 0 if
-        there is no time base or too few frames were tracked.
-    """
-
-    pulses: Pulses
-    lines: tuple[TrackedLine | None, ...]
-    frequency_hz: float
-    strength: float
-
-
 def track_line(
     frames: Iterable[Image],
     frame_rate_hz: float | None,
     tracker: LineTracker | None = None,
     current_a: FloatArray | None = None,
-) -> LineFilm:
+) -> tuple[Pulses, tuple[TrackedLine | None, ...]]:
     """Classify the frames of a recording by pulse, and track its line in those without a pulse.
 
     The line is measured in every frame that is not blinded. Results of frames that are later
     classified as having a pulse are discarded. ``tracker`` is that of the preceding frames;
-    ``current_a`` as in `classify_pulses`.
+    ``current_a`` as in `classify_pulses`. Returns the frames with and without a pulse, and the line
+    in each frame; None if it is lost or a pulse is on.
     """
     tracker = tracker or LineTracker()
     bright, lines = list[float](), list[TrackedLine | None]()
@@ -218,15 +202,7 @@ def track_line(
         blinded = bright[-1] > BLINDED * min(recent) + BLINDED_LEVELS
         lines.append(None if blinded else tracker.follow(frame))
     pulses = classify_pulses(np.array(bright), frame_rate_hz, current_a)
-    kept = tuple(None if on else one for one, on in zip(lines, pulses.on, strict=True))
-    if frame_rate_hz is None:
-        return LineFilm(pulses, kept, float("nan"), 0.0)
-    seen = [(k / frame_rate_hz, one.shift_px) for k, one in enumerate(kept) if one is not None]
-    if not seen:
-        return LineFilm(pulses, kept, float("nan"), 0.0)
-    time_s, shift = np.array(seen).T
-    frequency_hz, strength = oscillation_frequency(time_s, shift)
-    return LineFilm(pulses, kept, frequency_hz, strength)
+    return pulses, tuple(None if on else one for one, on in zip(lines, pulses.on, strict=True))
 
 
 def oscillation_frequency(time_s: FloatArray, values: FloatArray) -> tuple[float, float]:
@@ -248,11 +224,19 @@ def oscillation_frequency(time_s: FloatArray, values: FloatArray) -> tuple[float
     kept = np.abs(swing) < limit
     step = 1.0 / (OVERSAMPLE * max(float(np.ptp(time_s)), 1e-9))
     rates = np.arange(LOWEST_HZ, HIGHEST_HZ, step)
-    power = scipy.signal.lombscargle(
-        time_s[kept], swing[kept], 2 * np.pi * rates, normalize=True, floating_mean=True
-    )
+    at_once = max(TERMS_AT_ONCE // int(kept.sum()), 1)
+    parts = (rates[first : first + at_once] for first in range(0, len(rates), at_once))
+    power = np.concatenate([_variance_share(time_s[kept], swing[kept], part) for part in parts])
     best = int(np.argmax(power))
     if 0 < best < len(power) - 1:
         before, top, after = power[best - 1 : best + 2]
         rates[best] += step * (before - after) / (2 * (before - 2 * top + after))
     return float(rates[best]), float(power[best])
+
+
+def _variance_share(time_s: FloatArray, swing: FloatArray, rates_hz: FloatArray) -> FloatArray:
+    """Share of the variance of n values that an oscillation at each of f frequencies has, (f,)."""
+    power = scipy.signal.lombscargle(
+        time_s, swing, 2 * np.pi * rates_hz, normalize=True, floating_mean=True
+    )
+    return np.atleast_1d(power)

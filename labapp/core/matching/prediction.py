@@ -84,8 +84,8 @@ class Prediction:
     ----------
     at
         Rows and columns of the rays in the pattern's arrays, counted from 0, shape (m, 2).
-    points_mm, slopes
-        Reflection points, shape (m, 3), mm, and the surface's slopes there, shape (m, 2).
+    points_mm
+        Reflection points, shape (m, 3), mm.
     plane_mm
         Dots, IPCS, shape (m, 2), mm.
     spacing_mm
@@ -94,7 +94,6 @@ class Prediction:
 
     at: IntArray
     points_mm: FloatArray
-    slopes: FloatArray
     plane_mm: FloatArray
     spacing_mm: FloatArray
 
@@ -132,7 +131,7 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
 
     at = np.argwhere(where)
     index, surface, pose = tuple(at.T), pool.surface, observed.rig.imaging_plane.pose_mm
-    points, slopes, plane = ray_kernels.intersect_and_reflect(
+    points, _, plane = ray_kernels.intersect_and_reflect(
         surface.basis.grid,
         surface.coefficients,
         observed.rays.directions[index],
@@ -141,8 +140,8 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
         pose,
     )
     finite = np.isfinite(plane[:, 0])
-    at, points, slopes, plane = at[finite], points[finite], slopes[finite], plane[finite]
-    return Prediction(at, points, slopes, plane, band_pass_kernels.next_apart(plane))
+    at, points, plane = at[finite], points[finite], plane[finite]
+    return Prediction(at, points, plane, band_pass_kernels.next_apart(plane))
 
 
 def sure_pairs(

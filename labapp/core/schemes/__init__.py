@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from labapp.core.match import Match
     from labapp.core.surface.reconstruction import Reconstruction
 
+LEAST_DOTS = 9
+"""Minimum number of matched dots for a surface."""
+
 
 class Words(NamedTuple):
     """Display names of a scheme: a short one, and a long one for lists of choices."""

@@ -37,7 +37,7 @@ class ErsSettings:
     boundary: BoundaryModel = "piecewise"
 
 
-def reconstruct(match: Match, rig: Rig, settings: ErsSettings | None = None) -> Reconstruction:
+def reconstruct(match: Match, rig: Rig, settings: ErsSettings) -> Reconstruction:
     """Reconstruct the pool surface by extrapolation (Fig. 7-1).
 
     The boundary model gives X and Y of the boundary, the extrapolated surface its Z; the whole
@@ -48,13 +48,10 @@ def reconstruct(match: Match, rig: Rig, settings: ErsSettings | None = None) -> 
     CannotMeasure
         ``too-few-dots``, ``no-surface`` or ``no-boundary``.
     """
-    settings = settings or ErsSettings()
     rays = reflected_rays(match, rig)
     paths = Paths.along(parents_from(rays.ray, head_left(rays.ray, rig.head_sign)), rays.direction)
     work_piece = rays.distance_at(0.0)
     best = best_of_loops(
-        match,
-        rig,
         rays,
         lambda normals, _: paths.follow(normals, work_piece),
         ThinPlateSurface,

@@ -8,6 +8,7 @@ import numpy as np
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
+from labapp.core.schemes import LEAST_DOTS
 from labapp.core.surface import measures
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.boundary_trace import retrace_boundary, trace_boundary
@@ -18,9 +19,6 @@ from labapp.core.surface.shape import shape_and_gradients
 from labapp.core.surface.sizes import sizes_and_gradients
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
-
-LEAST_DOTS = 9
-"""Minimum number of reflections for a surface."""
 
 UNSETTLED_MM = 0.02
 """The fit has not converged if a reflection point still moves by this in the last round."""
@@ -106,7 +104,7 @@ def solve(
         )
     if not (match.witness < 0).any():
         raise CannotMeasure("open-boundary", "no visible ray is missing: the boundary is not seen")
-    pool = fit_pool(match, rig, settings, initial, by_uncertain_heights=True)
+    pool = fit_pool(match, rig, settings, initial, weigh_by_height_sigma=True)
     if pool.unsettled_mm > UNSETTLED_MM:
         raise CannotMeasure("no-surface", "the surface does not settle")
     return pool

@@ -52,7 +52,7 @@ def reconstruct_by(
         z -= _height_at_boundary(place, z, gradient, boundary)
         return np.asarray((z - rays.laser_mm[2]) / rays.direction[:, 2])
 
-    best = best_of_loops(match, rig, rays, move, ThinPlateSurface, loops)
+    best = best_of_loops(rays, move, ThinPlateSurface, loops)
     if best is None:
         raise CannotMeasure("no-surface", "the reflection points diverge from the first loop on")
     return reconstruction_within(scheme, match, rays, best, boundary)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,14 +11,15 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.schemes.slopes import (
     Estimate,
+    Move,
     Paths,
     ReflectedRays,
     best_of_loops,
-    lines,
     parents_along,
     parents_from,
     reconstruction_within,
     reflected_rays,
+    rows_or_columns,
 )
 from labapp.core.surface.boundary import BoundaryModel, boundary_on_work_piece
 from labapp.core.surface.interpolation import CloughTocherSurface
@@ -28,10 +28,6 @@ from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
 Algorithm = Literal["opa", "epa-r", "epa-c", "epa-rc"]
 """One-point algorithm; edge-points algorithm with row slopes, column slopes or both."""
-
-Move = Callable[[FloatArray, FloatArray], FloatArray]
-"""Step 2: function of the normals and previous distances that returns the distances of the
-slope-oriented points."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +56,7 @@ class IrsSettings:
     boundary: BoundaryModel = "piecewise"
 
 
-def reconstruct(match: Match, rig: Rig, settings: IrsSettings | None = None) -> Reconstruction:
+def reconstruct(match: Match, rig: Rig, settings: IrsSettings) -> Reconstruction:
     """Reconstruct the pool surface by interpolation (Fig. 6-2).
 
     The boundary lies on the work piece, z = 0; the whole surface is interpolated through
@@ -71,15 +67,14 @@ def reconstruct(match: Match, rig: Rig, settings: IrsSettings | None = None) -> 
     CannotMeasure
         ``too-few-dots``, ``no-surface`` or ``no-boundary``.
     """
-    settings = settings or IrsSettings()
     rays = reflected_rays(match, rig)
-    best = _best(estimates(match, rig, rays, settings), settings.are_margin)
+    best = _best(estimates(match, rays, settings), settings.are_margin)
     boundary = boundary_on_work_piece(match, rig, settings.boundary)
     return reconstruction_within("irs", match, rays, best, boundary)
 
 
 def estimates(
-    match: Match, rig: Rig, rays: ReflectedRays, settings: IrsSettings
+    match: Match, rays: ReflectedRays, settings: IrsSettings
 ) -> list[tuple[float, Estimate]]:
     """Best estimates for all heights of the base point, mm, that have one (Fig. 6-13).
 
@@ -90,7 +85,7 @@ def estimates(
     else:
         moves = [(0.0, _edge_points(rays, settings.algorithm))]
     found = (
-        (height, best_of_loops(match, rig, rays, move, CloughTocherSurface, settings.loops))
+        (height, best_of_loops(rays, move, CloughTocherSurface, settings.loops))
         for height, move in moves
     )
     return [(height, estimate) for height, estimate in found if estimate is not None]
@@ -135,7 +130,7 @@ def _one_point(
 
 def _edge_points(rays: ReflectedRays, algorithm: Algorithm) -> Move:
     """Edge-points algorithm: points are reached from the ends of their row or column (Fig. 6-5)."""
-    rows, columns = lines(rays.ray, axis=0), lines(rays.ray, axis=1)
+    rows, columns = rows_or_columns(rays.ray, axis=0), rows_or_columns(rays.ray, axis=1)
     row_paths, column_paths = _both_ways(rows, rays), _both_ways(columns, rays)
     edge = _ends(rows, len(rays.ray))
 

@@ -42,9 +42,8 @@ class ModalSettings:
     boundary: BoundaryModel = "piecewise"
 
 
-def reconstruct(match: Match, rig: Rig, settings: ModalSettings | None = None) -> Reconstruction:
+def reconstruct(match: Match, rig: Rig, settings: ModalSettings) -> Reconstruction:
     """Reconstruct the pool surface by modal integration; `CannotMeasure` as `reconstruct_by`."""
-    settings = settings or ModalSettings()
 
     def integrate(_: ReflectedRays, place: FloatArray, gradient: FloatArray) -> FloatArray:
         return heights(place, gradient, settings.order)

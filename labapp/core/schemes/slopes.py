@@ -29,6 +29,7 @@ from labapp.core.geometry.optics import (
 )
 from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.core.match import Match
+from labapp.core.schemes import LEAST_DOTS
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import SurfaceThroughPoints, whole_surface
 from labapp.core.surface.measures import reflection_scale
@@ -36,9 +37,8 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.surface import Surface, intersect
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
-FEWEST_DOTS = 9
-FEWEST_ROWS = 3
-"""Minimum numbers of dots and of rows for a surface."""
+LEAST_ROWS = 3
+"""Minimum number of rows for a surface."""
 
 SETTLED_MM = 1e-5
 """The loops end when no reflection point moves farther than this."""
@@ -49,6 +49,10 @@ PATIENCE = 10
 Where the slope changes its sign, Eq. 6-1 rises slightly too far from either side, so that the edge
 points of the edge-points algorithm climb from loop to loop and never converge.
 """
+
+Move = Callable[[FloatArray, FloatArray], FloatArray]
+"""Step 2: function of the normals, shape (n, 3), and the previous distances, shape (n,), mm, that
+returns the distances of the slope-oriented points, shape (n,), mm."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,8 @@ class ReflectedRays(ReadOnlyArrays):
         The imaging plane.
     measured
         Number of rays, the first ones, whose dots are those of the match.
+    scale
+        From the imaging plane to the work piece (`reflection_scale`), shape (2,).
     """
 
     laser_mm: FloatArray
@@ -79,6 +85,7 @@ class ReflectedRays(ReadOnlyArrays):
     plane_mm: FloatArray
     imaging_plane: ImagingPlane
     measured: int
+    scale: FloatArray
 
     def points(self, distance_mm: FloatArray) -> FloatArray:
         """Points at a distance along each ray, shape (n, 3), mm."""
@@ -119,14 +126,14 @@ def reflected_rays(match: Match, rig: Rig) -> ReflectedRays:
     Raises
     ------
     CannotMeasure
-        ``too-few-dots`` if there are fewer than `FEWEST_DOTS` or `FEWEST_ROWS`.
+        ``too-few-dots`` if there are fewer than `LEAST_DOTS` or `LEAST_ROWS`.
     """
     rows = len(np.unique(match.ray[:, 0]))
-    if len(match.ray) < FEWEST_DOTS or rows < FEWEST_ROWS:
+    if len(match.ray) < LEAST_DOTS or rows < LEAST_ROWS:
         raise CannotMeasure(
             "too-few-dots",
             f"{len(match.ray)} matched dots in {rows} rows; "
-            f"at least {FEWEST_DOTS} in {FEWEST_ROWS} are needed",
+            f"at least {LEAST_DOTS} in {LEAST_ROWS} are needed",
         )
     ray, plane = match.ray, match.plane_mm
     i, j = rig.pattern.center_ray
@@ -143,6 +150,7 @@ def reflected_rays(match: Match, rig: Rig) -> ReflectedRays:
         plane_mm=plane,
         imaging_plane=rig.imaging_plane,
         measured=len(match.ray),
+        scale=reflection_scale(match, rig),
     )
 
 
@@ -254,10 +262,10 @@ def _components(vector: FloatArray, horizontal: FloatArray, upward: FloatArray) 
     return np.stack([_dot(vector, horizontal), _dot(vector, upward)], axis=-1)
 
 
-def lines(ray: IntArray, axis: int) -> list[IntArray]:
+def rows_or_columns(ray: IntArray, axis: int) -> list[IntArray]:
     """Indices of the rays in every row (axis 0) or column (axis 1), each in ascending order.
 
-    A line may have gaps, which are skipped.
+    Rows and columns may have gaps, which are skipped.
     """
     return [
         members[np.argsort(ray[members, 1 - axis])]
@@ -286,7 +294,7 @@ def parents_from(ray: IntArray, base: int) -> IntArray:
     IntArray
         Shape (n,), −1 for the base point.
     """
-    rows = lines(ray, axis=0)
+    rows = rows_or_columns(ray, axis=0)
     first = next(k for k, row in enumerate(rows) if base in row)
     column = ray[rows[first], 1]
     middle = int(column[np.argmin(np.abs(column - (column[0] + column[-1]) / 2))])
@@ -331,10 +339,8 @@ class Estimate:
 
 
 def best_of_loops(
-    match: Match,
-    rig: Rig,
     rays: ReflectedRays,
-    move: Callable[[FloatArray, FloatArray], FloatArray],
+    move: Move,
     surface_through: Callable[[FloatArray], SurfaceThroughPoints],
     loops: int,
 ) -> Estimate | None:
@@ -345,13 +351,10 @@ def best_of_loops(
 
     Parameters
     ----------
-    match, rig
-        Matched dots, and the rig.
     rays
-        Result of `reflected_rays` for these.
+        The n rays that came back.
     move
-        Step 2: function of the normals, shape (n, 3), and the previous distances, shape (n,), that
-        returns the distances, shape (n,).
+        Step 2.
     surface_through
         Step 3: function of points, shape (n, 3), that returns the surface through them.
     loops
@@ -362,7 +365,6 @@ def best_of_loops(
     Estimate | None
         None if the points diverge before there is an estimate.
     """
-    scale = reflection_scale(match, rig)
     distance = rays.distance_at(0.0)
     best: Estimate | None = None
     since_best = 0
@@ -373,7 +375,7 @@ def best_of_loops(
             break
         surface = surface_through(points)
         residual = (rays.reflected(points, surface.point_gradient) - rays.plane_mm)[: rays.measured]
-        are = float(np.mean(np.hypot(*(residual * scale).T)))
+        are = float(np.mean(np.hypot(*(residual * rays.scale).T)))
         if np.isfinite(are) and (best is None or are < best.are_mm):
             best, since_best = Estimate(points, surface, are), 0
         else:

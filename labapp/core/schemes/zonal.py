@@ -15,7 +15,7 @@ import numpy as np
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.schemes.integration import reconstruct_by
-from labapp.core.schemes.slopes import ReflectedRays, lines
+from labapp.core.schemes.slopes import ReflectedRays, rows_or_columns
 from labapp.core.surface.boundary import BoundaryModel
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
@@ -37,9 +37,8 @@ class ZonalSettings:
     boundary: BoundaryModel = "piecewise"
 
 
-def reconstruct(match: Match, rig: Rig, settings: ZonalSettings | None = None) -> Reconstruction:
+def reconstruct(match: Match, rig: Rig, settings: ZonalSettings) -> Reconstruction:
     """Reconstruct the pool surface by zonal integration; `CannotMeasure` as `reconstruct_by`."""
-    settings = settings or ZonalSettings()
     return reconstruct_by("zonal", heights, match, rig, settings.loops, settings.boundary)
 
 
@@ -48,7 +47,7 @@ def heights(rays: ReflectedRays, place: FloatArray, gradient: FloatArray) -> Flo
 
     Points that are not connected to others by neighbours get the minimum-norm height, 0.
     """
-    chains = [*lines(rays.ray, axis=0), *lines(rays.ray, axis=1)]
+    chains = [*rows_or_columns(rays.ray, axis=0), *rows_or_columns(rays.ray, axis=1)]
     start, end = np.concatenate([np.stack([one[:-1], one[1:]]) for one in chains], axis=1)
     change = np.sum((gradient[start] + gradient[end]) / 2 * (place[end] - place[start]), axis=-1)
     step = np.arange(len(start))

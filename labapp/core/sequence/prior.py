@@ -17,9 +17,9 @@ from labapp.core.schemes.fit import UNSETTLED_MM, Known, SetupPart, nearest_part
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.level import Level
 from labapp.core.surface.measures import Measures
-from labapp.core.surface.pool_fit import NEWTON_STEPS, FitSettings, FittedPool, normal_equations
+from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equations
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.core.surface.solver import Rounds
+from labapp.core.surface.solver import NEWTON_STEPS, Rounds
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 

@@ -23,14 +23,14 @@ from labapp.core.matching.observation import UNLABELLED, Observation, amid, coun
 from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
 from labapp.core.matching.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
-from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
+from labapp.core.schemes import LEAST_DOTS
+from labapp.core.schemes.fit import UNSETTLED_MM
 from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Prior, Tracked, predictions
-from labapp.core.surface.level import Level, Witnesses
+from labapp.core.surface.level import Level, LevelSearch, Witnesses
 from labapp.core.surface.pool_fit import (
     FitSettings,
     fitted_pool,
     normal_equations,
-    rounds_with_level,
 )
 from labapp.core.surface.solver import Rounds
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, median
@@ -398,15 +398,8 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     sigma = fit.rounds.height_sigma_mm(witnesses.landing_mm)
     witnesses = replace(witnesses, height_sigma_mm=sigma)
     near = replace(prior.level, shift_mm=0.0, sigma_mm=prior.level_sigma_mm)
-    level = rounds_with_level(
-        fit.rounds,
-        witnesses,
-        most=fit.settings.rounds,
-        until_mm=SETTLED_MM,
-        near=near,
-        drop_is_free=prior.drop_is_free,
-        raised_mm=RAISED_MM,
-    )
+    search = LevelSearch(witnesses, near, prior.drop_is_free, RAISED_MM)
+    level = fit.rounds.run(fit.settings.rounds, SETTLED_MM, search=search)
     fit.check_settled()
     return RayClasses(witness, found.missed, found.stray), level
 

@@ -7,13 +7,15 @@ pool's rear, which may lie below it (§7.2).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
 from labapp.core.geometry.optics import ProjectedRays
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
+
+_LevelInput = tuple[BoolArray, FloatArray, IntArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Rear:
     @property
     def as_array(self) -> FloatArray:
         """Drop, start and end as an array for compiled functions, shape (3,), mm."""
-        return np.array([self.drop_mm, self.start_mm, self.end_mm])
+        return np.array(astuple(self), float)
 
     def height(self, y_mm: FloatArray) -> FloatArray:
         """Height of the boundary at y, of the shape of ``y_mm``, mm.
@@ -88,20 +90,8 @@ class Level:
     @property
     def as_array(self) -> FloatArray:
         """Values as an array for compiled functions (`of`), shape (11,)."""
-        values = [
-            self.shift_mm,
-            self.sigma_mm,
-            self.sign,
-            self.rear.drop_mm,
-            self.rear.start_mm,
-            self.rear.end_mm,
-            self.negative_log_likelihood,
-            self.ray_count,
-            self.rise_mm,
-            self.drop_sigma_mm,
-            self.drop_covariance_mm2,
-        ]
-        return np.array(values, float)
+        shift, sigma, sign, rear, *others = astuple(self)
+        return np.array([shift, sigma, sign, *rear, *others], float)
 
     def sigma_of(self, by_shift: FloatArray, by_drop: FloatArray) -> FloatArray:
         """Standard uncertainty of quantities due to that of the level, shape (m,).
@@ -184,3 +174,51 @@ class Witnesses(ReadOnlyArrays):
             self.missing,
             level_kernels.BLURS,
         )
+
+
+@dataclass(frozen=True)
+class LevelSearch:
+    """How rounds of a fit determine the level (`solver.Rounds.run`).
+
+    Parameters
+    ----------
+    witnesses
+        Rays that determine the level.
+    near
+        Initial estimate of the level for the first search. None: all levels are tried.
+    drop_is_free
+        Whether the drop of the rear is found along with the level, in the first half of the rounds.
+        While it is fixed, the uncertainty of the level is not reduced.
+    level_settled_mm
+        After a shift of the surface by less, the level is not determined again.
+    outer
+        Mask of the reflection points far from their centre, shape (n,), from which the level is
+        guessed if no witness is dark (`level_kernels.guess_level`). None: it is not guessed.
+    """
+
+    witnesses: Witnesses
+    near: Level | None = None
+    drop_is_free: bool = True
+    level_settled_mm: float = 0.0
+    outer: BoolArray | None = None
+
+    @property
+    def for_kernel(self) -> tuple[_LevelInput, FloatArray, tuple[float, float, bool, bool, float]]:
+        """The level's arguments of `rounds_kernels.run_rounds`, and the last five limits."""
+        witnesses, near, outer = self.witnesses, self.near, self.outer
+        sigma = witnesses.height_sigma_mm
+        level_input = (
+            np.empty(0, bool) if outer is None else outer,
+            witnesses.landing_mm,
+            witnesses.sign,
+            np.zeros(len(witnesses.sign)) if sigma is None else sigma,
+            witnesses.spacing_mm,
+        )
+        level = near or Level(0.0, np.inf, 1, Rear(), 0.0)
+        flags = self.drop_is_free, near is not None
+        limits = (witnesses.head_sign, witnesses.missing, *flags, self.level_settled_mm)
+        return level_input, level.as_array, limits
+
+
+NO_SEARCH = LevelSearch(Witnesses(np.empty((0, 3)), np.empty(0, np.int64), np.ones(2), 1))
+"""The mean height of the reflection points stays."""

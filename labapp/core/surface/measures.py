@@ -16,7 +16,7 @@ from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.shape import shape_of
 from labapp.core.surface.surface import Surface
-from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, IntArray
 
 RINGS = 16
 """Samples along each radius; Gauss–Legendre, so that smooth pools are integrated exactly."""
@@ -25,40 +25,18 @@ STENCIL_MM = 0.1
 """Half the size of the patch on which an extreme is refined."""
 
 
-@dataclass(frozen=True)
-class ReflectionErrors(ReadOnlyArrays):
-    """Distances of computed from captured dots, mapped onto the work piece.
-
-    Parameters
-    ----------
-    are_mm, mre_mm
-        Average and maximum reflection error (Eq. 6-3, 6-4), mm.
-    are_inner_mm, mre_inner_mm
-        The same without the first and the last row and both ends of each row (ARE-I, MRE-I of
-        §6.4.2), mm; NaN if nothing is left.
-    per_dot_mm
-        E_ij of each reflection point (Eq. 6-5), shape (n,), mm; NaN, and excluded from the above,
-        if the ray does not meet the surface.
-    scale
-        See `reflection_scale`, shape (2,).
-    """
-
-    are_mm: float
-    mre_mm: float
-    are_inner_mm: float
-    mre_inner_mm: float
-    per_dot_mm: FloatArray
-    scale: FloatArray
-
-
 @dataclass(frozen=True, repr=False)
 class Measures:
     """Measures of one pool. Lengths in mm, z above the work piece.
 
     Parameters
     ----------
-    are_mm, mre_mm, are_inner_mm, mre_inner_mm
-        Reflection errors, see `ReflectionErrors`.
+    are_mm, mre_mm
+        Average and maximum reflection error (Eq. 6-3, 6-4): distances of computed from captured
+        dots, mapped onto the work piece. Dots whose ray does not meet the surface are excluded.
+    are_inner_mm, mre_inner_mm
+        The same without the first and the last row and both ends of each row (ARE-I, MRE-I of
+        §6.4.2); NaN if nothing is left.
     width_mm, length_mm
         Extent of the boundary along X and along Y.
     height_mm, depth_mm
@@ -191,13 +169,13 @@ def measure_surface(reconstruction: Reconstruction, match: Match, rig: Rig) -> M
 
 
 def assemble_measures(
-    errors: ReflectionErrors,
+    errors: dict[str, float],
     size: FloatArray,
     peak_mm: FloatArray,
     center_mm: FloatArray,
     reconstruction: Reconstruction,
 ) -> Measures:
-    """Assemble errors, sizes and shape, shape (9,), peak, centre and σ of a reconstruction."""
+    """Assemble `reflection_errors`, sizes and shape, shape (9,), peak, centre and σ."""
     sigmas = {
         "": reconstruction.size_sigma,
         "level": reconstruction.size_sigma_level,
@@ -209,16 +187,11 @@ def assemble_measures(
         for name, value in zip(sigma_names(part), sigma.tolist(), strict=True)
     }
     return Measures(
-        are_mm=errors.are_mm,
-        mre_mm=errors.mre_mm,
-        are_inner_mm=errors.are_inner_mm,
-        mre_inner_mm=errors.mre_inner_mm,
         center_x_mm=float(center_mm[0]),
         center_y_mm=float(center_mm[1]),
         peak_x_mm=float(peak_mm[0]),
         peak_y_mm=float(peak_mm[1]),
-        scale_x=float(errors.scale[0]),
-        scale_z=float(errors.scale[1]),
+        **errors,
         **dict(zip(WITH_SIGMA, (size + 0.0).tolist(), strict=True)),
         **size_sigmas,
     )
@@ -234,8 +207,11 @@ def reflection_scale(match: Match, rig: Rig) -> FloatArray:
     return np.asarray(np.ptp(projected, axis=0) / np.ptp(match.plane_mm, axis=0))
 
 
-def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) -> ReflectionErrors:
-    """Reflection errors of a reconstruction by any scheme (Eq. 6-3 … 6-8).
+def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) -> dict[str, float]:
+    """Reflection errors of a reconstruction by any scheme (Eq. 6-3 … 6-8), and their scale.
+
+    The keys are those of `Measures`: ``are_mm``, ``mre_mm``, ``are_inner_mm``, ``mre_inner_mm``,
+    ``scale_x`` and ``scale_z``.
 
     Only actual reflected dots are included: the centre reference that IRS and ERS add is "not an
     actual visible point" (§6.2), and the error of its substitute would be meaningless.
@@ -244,14 +220,14 @@ def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) ->
     error = np.hypot(*(reconstruction.residual_mm * scale).T)
     met = np.isfinite(error)
     every, inner = error[met], error[met & inside_points(reconstruction.ray)]
-    return ReflectionErrors(
-        are_mm=float(every.mean()) if len(every) else math.nan,
-        mre_mm=float(every.max()) if len(every) else math.nan,
-        are_inner_mm=float(inner.mean()) if len(inner) else math.nan,
-        mre_inner_mm=float(inner.max()) if len(inner) else math.nan,
-        per_dot_mm=error,
-        scale=scale,
-    )
+    return {
+        "are_mm": float(every.mean()) if len(every) else math.nan,
+        "mre_mm": float(every.max()) if len(every) else math.nan,
+        "are_inner_mm": float(inner.mean()) if len(inner) else math.nan,
+        "mre_inner_mm": float(inner.max()) if len(inner) else math.nan,
+        "scale_x": float(scale[0]),
+        "scale_z": float(scale[1]),
+    }
 
 
 def inside_points(ray: IntArray) -> BoolArray:

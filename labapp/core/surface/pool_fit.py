@@ -4,8 +4,7 @@ The fit is an iterated linear least-squares problem. It starts from the work pie
 given surface. Each round
 
 1. computes two slopes at each reflection point from the bisector of its ray and the direction to
-its
-   dot (Eq. 4-3);
+   its dot (Eq. 4-3);
 2. solves for the smooth spline surface that fits these slopes best (`solver`);
 3. shifts it to its level, which slopes do not determine (`level`);
 4. intersects the rays with it, which gives the next reflection points.
@@ -24,9 +23,9 @@ import numpy as np
 from labapp.core.geometry.optics import ProjectedRays, project_rays
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match, MatchedDots
-from labapp.core.surface.level import Level, Rear, Witnesses
+from labapp.core.surface.level import Level, LevelSearch, Witnesses
 from labapp.core.surface.solver import (
-    LevelSearch,
+    NEWTON_STEPS,
     NormalEquations,
     Rounds,
     height_sigma,
@@ -53,11 +52,12 @@ MOST_SPLINES = 3000
 those of a pool, but of a laser set up ten times too far away. The time grows with the square of the
 number, and there are many hypotheses."""
 
+REUSE_FLOORS = 1 / 50
+"""`NormalEquations.reuse_mm` of a fit over `FitSettings.floor_mm`, the least σ of the dots, on
+which the largest harmless value depends."""
+
 CORRELATED_MM2 = 1.0
 """Area over which a pool's third derivatives are correlated, mm²."""
-
-NEWTON_STEPS = 4
-"""Steps from a reflection point to that on the surface of the next round."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class FittedPool(ReadOnlyArrays):
     Parameters
     ----------
     surface
-        The surface, z = 0 at the boundary.
+        The surface, z = 0 at the boundary, except at a rear below the work piece (`Level.rear`).
     factor
         Cholesky factor of the normal matrix (`solver.normal_factor`).
     level
@@ -141,7 +141,7 @@ def fit_pool(
     settings: FitSettings,
     initial: SplineSurface | None = None,
     *,
-    by_uncertain_heights: bool = False,
+    weigh_by_height_sigma: bool = False,
 ) -> FittedPool:
     """Fit the surface that reflects each ray to its dot.
 
@@ -155,7 +155,7 @@ def fit_pool(
         See `FitSettings`.
     initial
         A surface to start from: fewer rounds are needed if it is close. None: z = 0.
-    by_uncertain_heights
+    weigh_by_height_sigma
         Whether rays count less for the level where the surface is uncertain, which takes longer.
 
     Raises
@@ -174,7 +174,7 @@ def fit_pool(
     equations = normal_equations(
         basis, rig, points, match.plane_mm, match.plane_covariance_mm2, settings
     )
-    equations.reuse_mm = settings.floor_mm / 50
+    equations.reuse_mm = REUSE_FLOORS * settings.floor_mm
     if initial is not None:
         points, _ = solver_kernels.newton_along_rays(
             initial.basis.grid, initial.coefficients, rays.directions[at], points, NEWTON_STEPS
@@ -183,11 +183,11 @@ def fit_pool(
     witnesses = Witnesses.of(rays, rig.head_sign, match.witness, basis, match.missing)
     outer = None if (witnesses.sign < 0).any() else _outer(rays.landing_mm[at][:, :2])
     most, until_mm = settings.rounds, settings.settled_mm
-    level = rounds_with_level(rounds, witnesses, most, until_mm, outer=outer)
-    if by_uncertain_heights and outer is None:
+    level = rounds.run(most, until_mm, search=LevelSearch(witnesses, outer=outer))
+    if weigh_by_height_sigma and outer is None:
         sigma = rounds.height_sigma_mm(witnesses.landing_mm)
         witnesses = replace(witnesses, height_sigma_mm=sigma)
-        level = rounds_with_level(rounds, witnesses, most, until_mm, near=level)
+        level = rounds.run(most, until_mm, search=LevelSearch(witnesses, level))
     return fitted_pool(rounds, level, rig, match.plane_mm)
 
 
@@ -212,58 +212,6 @@ def normal_equations(
     )
     stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
     return NormalEquations(basis, stiffness, laser, plane, dots, weights)
-
-
-def rounds_with_level(
-    rounds: Rounds,
-    witnesses: Witnesses,
-    most: int,
-    until_mm: float,
-    near: Level | None = None,
-    drop_is_free: bool = True,
-    raised_mm: float = 0.0,
-    outer: BoolArray | None = None,
-) -> Level:
-    """Run rounds of the fit with the level from the witnesses, and return the final level.
-
-    Parameters
-    ----------
-    rounds
-        The fit, which is modified.
-    witnesses
-        Rays that determine the level.
-    most, until_mm
-        See `Rounds.run`.
-    near
-        Initial estimate of the level for the first search. None: all levels are tried.
-    drop_is_free
-        Whether the drop of the rear is found along with the level, in the first half of the rounds.
-        While it is fixed, the uncertainty of the level is not reduced.
-    raised_mm
-        After a shift of the surface by less, the level is not determined again.
-    outer
-        Mask of the reflection points far from their centre, shape (n,), from which the level is
-        guessed if no witness is dark (`guess_level`).
-
-    Raises
-    ------
-    CannotMeasure
-        ``no-surface`` if no surface fits the slopes.
-    """
-    level = near or Level(0.0, np.inf, 1, Rear(), 0.0)
-    sigma = witnesses.height_sigma_mm
-    search = LevelSearch(
-        (
-            np.empty(0, bool) if outer is None else outer,
-            witnesses.landing_mm,
-            witnesses.sign,
-            np.zeros(len(witnesses.sign)) if sigma is None else sigma,
-            witnesses.spacing_mm,
-        ),
-        level.as_array,
-        (witnesses.head_sign, witnesses.missing, drop_is_free, near is not None, raised_mm),
-    )
-    return Level.of(rounds.run(most, until_mm, NEWTON_STEPS if near is None else 1, by=search))
 
 
 def _outer(places_mm: FloatArray) -> BoolArray:

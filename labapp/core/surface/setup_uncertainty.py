@@ -10,17 +10,15 @@ the bench perturbed by plus and minus one standard uncertainty, and half the dif
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from labapp.core.geometry.optics import ProjectedRays, project_rays
+from labapp.core.geometry.optics import project_rays
 from labapp.core.geometry.perturbation import aimed_as, moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match, MatchedDots
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equations
 from labapp.core.surface.solver import NormalEquations, height_sigma, normal_factor
-from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import FloatArray, IntArray
 
 ROUNDS = 3
 """Rounds in which the reflection points follow the surface: the remaining error is 0.1 %."""
@@ -59,11 +57,11 @@ def setup_changes(
     """
     from labapp.core.surface.kernels import setup_kernels
 
-    known = rig.uncertainty
-    if known is None:
+    uncertainty = rig.uncertainty
+    if uncertainty is None:
         return np.zeros((len(gradient), 0))
-    changes = np.zeros((len(gradient), len(known.root)))
-    benches = _Perturbed.of(rig, match.plane_mm)
+    changes = np.zeros((len(gradient), len(uncertainty.root)))
+    columns, benches = _benches(rig, match.plane_mm)
     equations = _factorised(match, rig, settings, pool)
     change = _response(match.ray, equations, pool, benches) / SHARE
     basis, level, own = pool.surface.basis, pool.level, project_rays(rig.laser, rig.pattern)
@@ -71,16 +69,18 @@ def setup_changes(
     landing, mean = own.landing_mm[seen], pool.mean_splines
     assert equations.factor is not None
     sigma = height_sigma(basis, equations.factor, equations.inverse, mean, landing)
+    moved = [
+        project_rays(bench.laser, bench.pattern).landing_mm[seen] - landing for bench, _ in benches
+    ]
     raised = setup_kernels.level_changes(
         basis.grid,
         pool.surface.coefficients,
         change,
         (landing, match.witness[seen], sigma, own.spacing_mm),
-        np.reshape([rays.landing_mm[seen] - landing for rays in benches.rays], (-1, *landing.shape))
-        / SHARE,
+        np.reshape(moved, (-1, *landing.shape)) / SHARE,
         np.array([rig.head_sign, level.rear.drop_mm, level.sign, REACH, match.missing]),
     )
-    changes[:, benches.columns] = gradient @ (change + raised[:, None]).T
+    changes[:, columns] = gradient @ (change + raised[:, None]).T
     return changes
 
 
@@ -101,63 +101,35 @@ def residual_changes(
 
     assert rig.uncertainty is not None
     at, surface = tuple(match.ray.T - 1), pool.surface
-    benches = _Perturbed.of(rig, match.plane_mm)
+    columns, benches = _benches(rig, match.plane_mm)
     equations = _factorised(match, rig, settings, pool)
-    change = _response(match.ray, equations, pool, benches)
+    responses = _response(match.ray, equations, pool, benches)
     changes = np.zeros((*match.plane_mm.shape, len(rig.uncertainty.root)))
-    for number, k in enumerate(benches.columns):
-        rays, plane = benches.rays[number], benches.planes[number]
+    for k, change, (bench, plane_mm) in zip(columns, responses, benches, strict=True):
+        rays, plane = project_rays(bench.laser, bench.pattern), bench.imaging_plane.pose_mm
         directions, landing = rays.directions[at], rays.landing_mm[at]
-        coefficients = surface.coefficients + change[number]
+        coefficients = surface.coefficients + change
         _, _, computed = ray_kernels.intersect_and_reflect(
             surface.basis.grid, coefficients, directions, landing, NEWTON_STEPS, plane
         )
-        off = computed - benches.plane_mm[number] - pool.residual_mm
+        off = computed - plane_mm - pool.residual_mm
         changes[..., k] = off / SHARE
     return changes
 
 
-@dataclass(frozen=True)
-class _Perturbed(ReadOnlyArrays):
-    """The bench perturbed by `SHARE` of each of q columns of the root of its covariance.
+def _benches(rig: Rig, plane_mm: FloatArray) -> tuple[IntArray, list[tuple[Rig, FloatArray]]]:
+    """Perturb a rig with an uncertainty and the dots on its plane, shape (n, 2), mm.
 
-    Parameters
-    ----------
-    columns
-        The columns that are not 0, shape (q,).
-    lasers, planes
-        Positions of the laser, shape (q, 3), mm, and imaging planes (`ImagingPlane.pose_mm`), shape
-        (q, 5, 3).
-    rays
-        The rays of each bench.
-    plane_mm, dots_mm
-        The dots on the imaging plane, shape (q, n, 2), and in the UCS, shape (q, n, 3), mm.
+    Returns
+    -------
+    columns, benches
+        Columns of `RigUncertainty.root` that are not 0, shape (q,); for `SHARE` of each of them the
+        perturbed rig and the dots on its plane, shape (n, 2), mm.
     """
-
-    columns: IntArray
-    lasers: FloatArray
-    planes: FloatArray
-    rays: tuple[ProjectedRays, ...]
-    plane_mm: FloatArray
-    dots_mm: FloatArray
-
-    @classmethod
-    def of(cls, rig: Rig, plane_mm: FloatArray) -> _Perturbed:
-        """Perturb a rig with an uncertainty and the dots on its plane, shape (n, 2), mm."""
-        assert rig.uncertainty is not None
-        root = SHARE * rig.uncertainty.root
-        columns = np.flatnonzero(root.any(axis=0))
-        benches = [perturbed(rig, root[:, k], plane_mm) for k in columns]
-        rigs, count = [moved for moved, _ in benches], len(columns)
-        dots_mm = [moved.imaging_plane.to_universal(dots) for moved, dots in benches]
-        return cls(
-            columns,
-            np.reshape([moved.laser.position_mm for moved in rigs], (count, 3)),
-            np.reshape([moved.imaging_plane.pose_mm for moved in rigs], (count, 5, 3)),
-            tuple(project_rays(moved.laser, moved.pattern) for moved in rigs),
-            np.reshape([dots for _, dots in benches], (count, len(plane_mm), 2)),
-            np.reshape(dots_mm, (count, len(plane_mm), 3)),
-        )
+    assert rig.uncertainty is not None
+    root = SHARE * rig.uncertainty.root
+    columns = np.flatnonzero(root.any(axis=0))
+    return columns, [perturbed(rig, root[:, k], plane_mm) for k in columns]
 
 
 def _factorised(
@@ -171,14 +143,25 @@ def _factorised(
 
 
 def _response(
-    ray: IntArray, own: NormalEquations, pool: FittedPool, benches: _Perturbed
+    ray: IntArray,
+    own: NormalEquations,
+    pool: FittedPool,
+    benches: list[tuple[Rig, FloatArray]],
 ) -> FloatArray:
     """Changes of a fit's p coefficients for q slightly perturbed benches, shape (q, p), mm."""
     from labapp.core.surface.kernels import setup_kernels
 
     surface, at, factor = pool.surface, tuple(ray.T - 1), own.factor
     assert factor is not None
-    rays = np.reshape([each.directions[at] for each in benches.rays], benches.dots_mm.shape)
+    if not benches:
+        return np.zeros((0, len(surface.coefficients)))
+    rigs = [rig for rig, _ in benches]
+    moved = (
+        np.array([rig.laser.position_mm for rig in rigs]),
+        np.array([rig.imaging_plane.pose_mm for rig in rigs]),
+        np.array([project_rays(rig.laser, rig.pattern).directions[at] for rig in rigs]),
+        np.array([rig.imaging_plane.to_universal(plane_mm) for rig, plane_mm in benches]),
+    )
     return setup_kernels.coefficient_changes(
         surface.basis.grid,
         surface.coefficients,
@@ -186,7 +169,7 @@ def _response(
         pool.points_mm,
         own.weights,
         (own.laser_mm, own.plane, own.dots_mm),
-        (benches.lasers, benches.planes, rays, benches.dots_mm),
+        moved,
         ROUNDS,
     )
 

@@ -1,4 +1,4 @@
-"""Shape parameters of a pool's surface, from which later work estimates penetration.
+"""Shape of a pool's surface, from which work after the dissertation estimates penetration.
 
 Width, length and convexity together predicted the width of the back-side bead best (W. J. Zhang et
 al., "Characterization of Three-Dimensional Weld Pool Surface in GTAW", Weld. J. 91 (2012) 195-s).
@@ -8,7 +8,6 @@ Asymmetry and slope at the boundary indicate a torch beside the joint, undercut 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -36,7 +35,7 @@ def shape_of(surface: Surface, boundary: Boundary) -> FloatArray:
     boundary
         The pool's boundary.
     """
-    return _Samples.of(surface, boundary).shape
+    return _shape_parameters(*_samples(surface, boundary))
 
 
 def shape_and_gradients(
@@ -60,18 +59,17 @@ def shape_and_gradients(
     """
     from labapp.core.surface.kernels import shape_kernels
 
-    samples, outline = _Samples.of(_Evaluated(basis, coefficients), boundary), boundary.points_mm
-    spokes = samples.middle_mm, samples.reach_mm, samples.place_mm, samples.height_mm
-    rim = samples.length_mm, samples.inward, samples.rim_mm, samples.rise
-    return samples.shape, shape_kernels.shape_gradients(
+    spokes, rim = _samples(_Evaluated(basis, coefficients), boundary)
+    parameters = _shape_parameters(spokes, rim)
+    return parameters, shape_kernels.shape_gradients(
         basis.grid,
         coefficients,
-        outline,
+        boundary.points_mm,
         boundary_slope,
         rear.as_array,
         spokes,
         rim,
-        samples.shape,
+        parameters,
     )
 
 
@@ -95,60 +93,42 @@ class _Evaluated:
         return spline_kernels.surface_at(self.basis.grid, self.coefficients, places)
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """Samples of a surface on spokes from the middle of its boundary, and next to the boundary.
+_Samples = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
-    Parameters
-    ----------
-    middle_mm, reach_mm
-        Middle of the boundary, shape (2,); length of each spoke, shape (s,).
-    place_mm, height_mm
-        Shape (s, r, 2) and (s, r).
-    length_mm, inward, rim_mm, rise
-        At each of m boundary points: the length of boundary that it represents, shape (m,); the
-        inward normal and the place where the slope is evaluated, shape (m, 2); the slope, shape
-        (m,).
+
+def _samples(surface: Surface, boundary: Boundary) -> tuple[_Samples, _Samples]:
+    """Sample a surface on spokes from the middle of its boundary, and next to the boundary.
+
+    Returns the ``spokes`` and the ``rim`` of `shape_kernels.shape_gradients`.
     """
+    from labapp.core.surface.kernels import shape_kernels
 
-    middle_mm: FloatArray
-    reach_mm: FloatArray
-    place_mm: FloatArray
-    height_mm: FloatArray
-    length_mm: FloatArray
-    inward: FloatArray
-    rim_mm: FloatArray
-    rise: FloatArray
+    spokes, rim = shape_kernels.sample_places(boundary.points_mm, boundary.center_mm)
+    (_, _, place_mm), (_, inward, rim_mm) = spokes, rim
+    height_mm = surface.height(place_mm[..., 0], place_mm[..., 1])
+    rise = np.vecdot(surface.gradient(rim_mm[:, 0], rim_mm[:, 1]), inward)
+    return (*spokes, height_mm), (*rim, rise)
 
-    @classmethod
-    def of(cls, surface: Surface, boundary: Boundary) -> _Samples:
-        from labapp.core.surface.kernels import shape_kernels
 
-        spokes, beside = shape_kernels.sample_places(boundary.points_mm, boundary.center_mm)
-        (middle, reach, place), (length, inward, rim) = spokes, beside
-        rise = np.vecdot(surface.gradient(rim[:, 0], rim[:, 1]), inward)
-        height = surface.height(place[..., 0], place[..., 1])
-        return cls(middle, reach, place, height, length, inward, rim, rise)
+def _shape_parameters(spokes: _Samples, rim: _Samples) -> FloatArray:
+    """`shape_of` the samples of a surface (`_samples`)."""
+    from labapp.core.surface.kernels.shape_kernels import (
+        ENDS,
+        FRACTION,
+        HALVED_WEIGHT,
+        RIGHT,
+        SPOKES,
+    )
 
-    @cached_property
-    def shape(self) -> FloatArray:
-        """See `shape_of`."""
-        from labapp.core.surface.kernels.shape_kernels import (
-            ENDS,
-            FRACTION,
-            RIGHT,
-            SPOKES,
-            WEIGHT,
-        )
-
-        lengths = self.reach_mm[ENDS, None] * WEIGHT
-        area = self.reach_mm[:, None] ** 2 * (WEIGHT * FRACTION) * (2 * np.pi / SPOKES)
-        volume = np.sum(area * np.abs(self.height_mm), axis=1)
-        right, left = RIGHT @ volume, (1 - RIGHT) @ volume
-        return np.array(
-            [
-                np.sum(self.height_mm[ENDS] * lengths) / lengths.sum(),
-                (right - left) / max(right + left, 1e-30),
-                np.degrees(np.arctan(self.rise)) @ self.length_mm / self.length_mm.sum(),
-            ]
-        )
+    (_, reach_mm, _, height_mm), (length_mm, _, _, rise) = spokes, rim
+    lengths = reach_mm[ENDS, None] * HALVED_WEIGHT
+    area = reach_mm[:, None] ** 2 * (HALVED_WEIGHT * FRACTION) * (2 * np.pi / SPOKES)
+    volume = np.sum(area * np.abs(height_mm), axis=1)
+    right, left = RIGHT @ volume, (1 - RIGHT) @ volume
+    return np.array(
+        [
+            np.sum(height_mm[ENDS] * lengths) / lengths.sum(),
+            (right - left) / max(right + left, 1e-30),
+            np.degrees(np.arctan(rise)) @ length_mm / length_mm.sum(),
+        ]
+    )

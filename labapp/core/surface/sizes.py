@@ -15,7 +15,8 @@ from labapp.core.values import FloatArray
 _NODE, WEIGHT = np.polynomial.legendre.leggauss(measures.RINGS)
 FRACTION = (_NODE + 1) / 2
 """Gauss–Legendre weights of the samples on a spoke from the centre to a boundary point, and their
-positions as fractions of its length."""
+positions as fractions of its length. The weights are not halved for the interval 0 … 1: the factor
+2 of ∫ 2 f df cancels it."""
 
 STRIDE = 4
 """Stride over boundary points: every fourth one has a spoke, as the surface is smooth."""

@@ -12,40 +12,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labapp.core.surface.level import NO_SEARCH, Level, LevelSearch
 from labapp.core.surface.spline import SplineBasis, SplineSurface
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
+from labapp.core.values import CannotMeasure, FloatArray
 
 REUSE_MM = 5e-3
 """By default a factor is reused if no reflection point has moved by more, which is small compared
 with the cells of the splines."""
 
+NEWTON_STEPS = 4
+"""Steps from a reflection point to that on the surface of the next round, if the level is searched
+for among all levels: the surface may then move far."""
 
 NO_SURFACE = "no surface has the slopes that the dots require"
-
-
-@dataclass(frozen=True)
-class LevelSearch:
-    """How the level is determined in each round, for compiled functions.
-
-    Parameters
-    ----------
-    witnesses, level
-        See `round_kernels.run_rounds`.
-    limits
-        The last five of its limits.
-    """
-
-    witnesses: tuple[BoolArray, FloatArray, IntArray, FloatArray, FloatArray]
-    level: FloatArray
-    limits: tuple[float, float, bool, bool, float]
-
-
-NO_SEARCH = LevelSearch(
-    (np.empty(0, bool), np.empty((0, 3)), np.empty(0, np.int64), np.empty(0), np.ones(2)),
-    np.zeros(9),
-    (1.0, 0.0, False, False, 0.0),
-)
-"""The mean height of the reflection points stays."""
 
 
 @dataclass
@@ -133,10 +112,9 @@ class Rounds:
         self,
         most: int,
         until_mm: float,
-        newton_steps: int = 1,
         smooth_about: FloatArray | None = None,
-        by: LevelSearch = NO_SEARCH,
-    ) -> FloatArray:
+        search: LevelSearch = NO_SEARCH,
+    ) -> Level:
         """Run rounds until no reflection point moves by ``until_mm``.
 
         In each the slopes at the reflection points become those that reflect the rays to their
@@ -149,18 +127,16 @@ class Rounds:
             Maximum number of rounds.
         until_mm
             See above, mm.
-        newton_steps
-            Newton steps from a reflection point to the surface of the next round.
         smooth_about
             Coefficients of a surface, shape (p,), mm: the roughness of the difference from it is
             penalised. None: that of the surface itself.
-        by
+        search
             Search for the level. By default the mean height of the points stays.
 
         Returns
         -------
-        FloatArray
-            The final level (`level_kernels.find_level`), shape (11,).
+        Level
+            The final level; of no meaning without a search.
 
         Raises
         ------
@@ -172,14 +148,16 @@ class Rounds:
         own = self.equations
         smooth = np.zeros_like(self.coefficients) if smooth_about is None else smooth_about
         known = (own.stiffness, np.nan) if own.factor is None else (own.factor, self.moved_mm)
-        limits = np.array([most, until_mm, newton_steps, own.reuse_mm, known[1], *by.limits])
+        steps = 1 if search is NO_SEARCH or search.near is not None else NEWTON_STEPS
+        level_input, level, search_limits = search.for_kernel
+        limits = np.array([most, until_mm, steps, own.reuse_mm, known[1], *search_limits])
         self.coefficients, self.points_mm, factor, level, (moved, is_new) = (
             round_kernels.run_rounds(
                 own.basis.grid,
                 (own.stiffness, self.rays, own.weights, own.laser_mm, own.plane, own.dots_mm),
                 (self.coefficients, smooth, self.points_mm, known[0]),
-                by.witnesses,
-                by.level,
+                level_input,
+                level,
                 limits,
             )
         )
@@ -188,7 +166,7 @@ class Rounds:
         self.moved_mm = float(moved)
         if np.isnan(moved):
             raise CannotMeasure("no-surface", NO_SURFACE)
-        return level
+        return Level.of(level)
 
 
 def normal_factor(

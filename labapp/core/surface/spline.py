@@ -243,7 +243,3 @@ class SplineSurface(ReadOnlyArrays):
         """∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² over the rectangle, mm⁻²."""
         band, c = self.basis.roughness, self.coefficients
         return float(c @ scipy.linalg.blas.dsbmv(len(band) - 1, 1.0, band, c, lower=1))
-
-    def raised(self, by_mm: float) -> SplineSurface:
-        """Shift the whole surface up."""
-        return SplineSurface(self.basis, self.coefficients + by_mm)  # the splines add up to 1

@@ -14,6 +14,9 @@ TOLERANCE_MM = 1e-9
 STEP_MM = 0.5
 """Longest Newton step along a ray: a grazing ray would otherwise jump off the pool."""
 
+REACH_MM = 2.0
+"""Intersections are searched for at |z| up to this."""
+
 NEWTON_STEPS = 12
 SCAN_LEVELS = 81
 HALVINGS = 50
@@ -50,13 +53,11 @@ def intersect(
     surface: Surface,
     origin_mm: FloatArray,
     directions: FloatArray,
-    *,
-    reach_mm: float = 2.0,
 ) -> FloatArray:
     """Intersect rays from one point with a surface.
 
     Bounded Newton steps from z = 0. Rays for which these do not converge (grazing, or starting
-    outside the domain of the surface) are sampled from ``reach_mm`` down to ``−reach_mm``, and the
+    outside the domain of the surface) are sampled from z = `REACH_MM` down to −`REACH_MM`, and the
     first interval in which the ray passes below the surface is bisected.
 
     Parameters
@@ -67,8 +68,6 @@ def intersect(
         Common origin of the rays, above the surface, shape (3,), mm.
     directions
         Their directions, of any length but not zero, shape (n, 3).
-    reach_mm
-        Intersections are searched for at |z| ≤ reach_mm.
 
     Returns
     -------
@@ -81,16 +80,14 @@ def intersect(
     direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     distance = np.full(len(direction), np.nan)
     falls = np.flatnonzero(direction[:, 2] < 0)
-    distance[falls] = _newton(surface, origin, direction[falls], reach_mm)
+    distance[falls] = _newton(surface, origin, direction[falls])
     missed = falls[np.isnan(distance[falls])]
     if len(missed):
-        distance[missed] = _walk(surface, origin, direction[missed], reach_mm)
+        distance[missed] = _walk(surface, origin, direction[missed])
     return np.asarray(origin + distance[:, None] * direction)
 
 
-def _newton(
-    surface: Surface, origin: FloatArray, direction: FloatArray, reach: float
-) -> FloatArray:
+def _newton(surface: Surface, origin: FloatArray, direction: FloatArray) -> FloatArray:
     """Distance to the surface along each ray, shape (n,); NaN if the steps do not converge."""
     distance = -origin[2] / direction[:, 2]
     above = np.full(len(direction), np.nan)
@@ -106,13 +103,13 @@ def _newton(
             step = np.clip(-above / descent, -STEP_MM, STEP_MM)
         # Where descent ≥ 0, a Newton step would go in the wrong direction.
         distance = np.where(open_ & (descent < 0), distance + step, distance)
-    low = np.abs(origin[2] + distance * direction[:, 2]) <= reach
+    low = np.abs(origin[2] + distance * direction[:, 2]) <= REACH_MM
     return np.where((np.abs(above) <= TOLERANCE_MM) & low, distance, np.nan)
 
 
-def _walk(surface: Surface, origin: FloatArray, direction: FloatArray, reach: float) -> FloatArray:
+def _walk(surface: Surface, origin: FloatArray, direction: FloatArray) -> FloatArray:
     """Distance to the first crossing from above, by sampling and bisection, shape (n,)."""
-    levels = np.linspace(reach, -reach, SCAN_LEVELS)
+    levels = np.linspace(REACH_MM, -REACH_MM, SCAN_LEVELS)
     distances = (levels[:, None] - origin[2]) / direction[:, 2]
 
     def above(distance: FloatArray) -> FloatArray:

@@ -45,30 +45,21 @@ class Ridges(ReadOnlyArrays):
     ----------
     image_px
         (u, v), shape (n, 2), px.
-    tangent
-        Unit vector along the ridge, shape (n, 2); its sign is arbitrary.
     strength
         Curvature across the ridge of the smoothed frame, grey levels/px², shape (n,).
     height
         Height of the smoothed frame's ridge over its background, grey levels, shape (n,).
     starts
         Start index of each of k chains, and n, shape (k + 1,).
-    noise
-        Standard deviation of ``strength`` without a ridge.
     smooth
         The smoothed frame, shape (height, width).
     """
 
     image_px: FloatArray
-    tangent: FloatArray
     strength: FloatArray
     height: FloatArray
     starts: IntArray
-    noise: float
     smooth: Grey
-
-    def __len__(self) -> int:
-        return len(self.starts) - 1
 
 
 @lru_cache(maxsize=8)
@@ -123,7 +114,7 @@ def find_ridges(frame: Image, scale_px: float = SCALE_PX) -> Ridges:
     chosen, starts = ridge_kernels.link(index, pixel, place, along, order, seeds)
     place, along, strength = place[chosen], along[chosen], strength[chosen]
     height = _height(smooth, place, along, scale_px)
-    return Ridges(place, along, strength, height, starts, noise, smooth)
+    return Ridges(place, strength, height, starts, smooth)
 
 
 def sampled(picture: Grey, place: FloatArray) -> Grey:

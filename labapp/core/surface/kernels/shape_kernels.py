@@ -29,7 +29,7 @@ SPOKES, RINGS = 48, 8
 along each."""
 
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(RINGS)
-FRACTION, WEIGHT = (_NODE + 1) / 2, _WEIGHT / 2
+FRACTION, HALVED_WEIGHT = (_NODE + 1) / 2, _WEIGHT / 2
 """Fractions of the way outwards at which the surface is sampled, and their weights."""
 
 PHI = -np.pi / 2 + 2 * np.pi * np.arange(SPOKES) / SPOKES
@@ -134,7 +134,7 @@ def _convexity(
         for r in range(RINGS):
             x, y = place[e, r]
             _, slope_x, _ = height_and_slopes(grid, coefficients, x, y, work)
-            share = reach[e] * WEIGHT[r] / length
+            share = reach[e] * HALVED_WEIGHT[r] / length
             aside += share * slope_x
             accumulate_splines(grid, x, y, share, work, out)
         slope_x = _around(angle, order, boundary_slope[:, 0], PHI[e])
@@ -166,11 +166,11 @@ def _asymmetry(
     area, total, across = np.empty((SPOKES, RINGS)), 0.0, 0.0
     for s in range(SPOKES):
         for r in range(RINGS):
-            area[s, r] = reach[s] ** 2 * WEIGHT[r] * FRACTION[r] * 2 * np.pi / SPOKES
+            area[s, r] = reach[s] ** 2 * HALVED_WEIGHT[r] * FRACTION[r] * 2 * np.pi / SPOKES
             total += area[s, r] * abs(height[s, r])
     for e in ENDS:
         for r in range(RINGS):
-            across += reach[e] * WEIGHT[r] * abs(height[e, r])
+            across += reach[e] * HALVED_WEIGHT[r] * abs(height[e, r])
     # The weight of the right side is 1 − asymmetry, that of the left −(1 + asymmetry).
     work = np.empty((4, 4))
     for s in range(SPOKES):
