@@ -180,6 +180,22 @@ def test_table_grows_and_delete_clears_cells(qtbot: QtBot, page: LaserPage) -> N
     assert page.readings().lengths_mm[0] == ()
 
 
+def test_length_in_the_drawing_replaces_the_reading_of_any_row(
+    qtbot: QtBot, page: LaserPage
+) -> None:
+    clear(page)
+    fill(page, 1, ("5", "", ""))
+    field = page.length_fields[0]
+    field.editor.selectAll()
+    qtbot.keyClicks(field.editor, "6")
+    field.flush()
+    assert page.readings().lengths_mm[0] == (6.0,)
+    assert field.editor.isEnabled()
+    field.editor.clear()
+    field.flush()
+    assert page.readings().lengths_mm[0] == ()
+
+
 def test_refresh_keeps_typed_readings(page: LaserPage) -> None:
     clear(page)
     fill(page, 0, ("1", "", ""))

@@ -70,6 +70,12 @@ class LaserResult:
         return () if self.found is None else tuple(map(_spoken, self.found.warnings))
 
 
+def length_mm(text: str) -> float | None:
+    """The length in a cell of the table, mm; None if it is none."""
+    value = parsed(text)
+    return value if value is not None and value > 0 else None
+
+
 def typed(
     cells: Mapping[tuple[int, int], str],
     fan_angle_deg: float,
@@ -81,8 +87,8 @@ def typed(
     for (row, column), text in sorted(cells.items()):
         if not text.strip():
             continue
-        value = parsed(text)
-        if value is None or value <= 0:
+        value = length_mm(text)
+        if value is None:
             wrong.append(f"{NAMES[column]}, reading {row + 1}: “{text.strip()}” is not a length")
         else:
             lengths[column].append(value)

@@ -262,8 +262,11 @@ class LaserPage(Page):
             field.lock(self.locked or (SEVERAL if several else ""))
 
     def _enter_length(self, column: int, value: float | None) -> None:
-        """Write a length entered in the drawing to the table."""
-        self.table.setItem(0, column, _cell("" if value is None else _length(value)))
+        """Write a length entered in the drawing to the row of the reading that it replaces."""
+        rows = range(self.table.rowCount())
+        known = (row for row in rows if presenter.length_mm(self._text(row, column)) is not None)
+        text = "" if value is None else _length(value)
+        self.table.setItem(next(known, 0), column, _cell(text))
 
     # --- the picture ------------------------------------------------------------------------
 
