@@ -256,6 +256,22 @@ def test_pictures_are_listed_edited_and_removed(
     assert not page.diameter.editor.isEnabled()
 
 
+def test_entered_uncertainties_can_be_cleared(
+    qtbot: QtBot, page: BenchCheckPage, tmp_path: Path
+) -> None:
+    add(qtbot, page, tmp_path, np.zeros((64, 48), np.uint8))
+    for field in (page.mirror_form.height_sigma, page.mirror_form.level):
+        field.editor.selectAll()
+        qtbot.keyClicks(field.editor, "0.02")
+        field.flush()
+    assert (page.chosen[0].height_sigma_mm, page.chosen[0].level_sigma_deg) == (0.02, 0.02)
+    for field in (page.mirror_form.height_sigma, page.mirror_form.level):
+        field.editor.clear()
+        field.flush()
+        assert field.problem.isHidden()
+    assert (page.chosen[0].height_sigma_mm, page.chosen[0].level_sigma_deg) == (None, None)
+
+
 def test_only_pictures_can_be_dropped(qtbot: QtBot, page: BenchCheckPage, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((64, 48), np.uint8))
     assert page.takes_files([tmp_path / "a.png"])

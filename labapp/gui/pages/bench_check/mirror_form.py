@@ -54,6 +54,7 @@ class MirrorForm(FieldForm):
             step=0.005,
             decimals=4,
             tooltip="Standard uncertainty of the height; empty: the usual one, in grey",
+            optional=True,
         )
         self.height_sigma.edited.connect(
             lambda value: change(replace(selected(), height_sigma_mm=value))
@@ -67,6 +68,7 @@ class MirrorForm(FieldForm):
             decimals=3,
             tooltip="How level the plate lies on the work piece, either way, one standard "
             "uncertainty; empty: the usual one, in grey. It limits what a check can do",
+            optional=True,
         )
         self.level.edited.connect(lambda value: change(replace(selected(), level_sigma_deg=value)))
         for field in self.fields:
