@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
 from labapp.core.images.exposure import Exposure, judge_exposure
@@ -16,7 +15,7 @@ from labapp.media import GreyImage, open_source
 from labapp.media.base import format_frame_rate
 from labapp.session.record import Recording
 from labapp.session.session import Session
-from labapp.text import format_bytes
+from labapp.text import format_bytes, local_time
 
 
 @dataclass(frozen=True)
@@ -161,11 +160,6 @@ def recording_facts(recording: Recording) -> tuple[tuple[str, str], ...]:
         ("SHA-256", recording.sha256),
         ("Imported", local_time(recording.imported)),
     )
-
-
-def local_time(iso: str) -> str:
-    """Text of an ISO 8601 time in local time."""
-    return f"{datetime.fromisoformat(iso).astimezone():%Y-%m-%d %H:%M}"
 
 
 def missing_text(session: Session) -> str:

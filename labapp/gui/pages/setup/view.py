@@ -33,6 +33,7 @@ from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick, ticked
 from labapp.session.session import Session
+from labapp.text import local_time
 
 ENTRIES = {entry.key: entry for _, entries in RIG for entry in entries}
 
@@ -110,7 +111,7 @@ class SetupPage(Page):
         times = dict(ticked(shown.record))
         for item, box in (self.ticks | self.steps).items():
             box.setChecked(item in times)
-            self._times[item].setText(f"ticked {_clock(times[item])}" if item in times else "")
+            self._times[item].setText(f"ticked {local_time(times[item])}" if item in times else "")
         self.tabs.setTabText(SAFETY_TAB, f"Safety {len(times.keys() & self.ticks)}/{len(SAFETY)}")
         self.tabs.setTabText(BENCH_TAB, "Bench ⚠" if shown.problems or shown.missing else "Bench")
         show_words(self.others, "\n".join(shown.others))
@@ -323,7 +324,3 @@ def _top(content: QWidget) -> QWidget:
     page = QWidget()
     fill(QVBoxLayout(page), content, 1)
     return page
-
-
-def _clock(iso: str) -> str:
-    return iso.partition("+")[0].replace("T", " ")
