@@ -134,6 +134,20 @@ def test_opening_shows_results_and_closing_the_welcome_page(
     qtbot.waitUntil(lambda: "30 frames, all measured" in plain.welcome.list.item(0).text())
 
 
+@pytest.mark.parametrize(("key", "name"), [("laser", "fan"), ("export", "spacing")])
+def test_edit_in_an_inactive_window_is_finished_when_the_session_closes(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot, key: str, name: str
+):
+    window.files.open(copy_sample("gtaw"))
+    window.show_step(key)
+    field = getattr(window.page, name)
+    field.editor.selectAll()
+    qtbot.keyClicks(field.editor, "0.5")  # without the focus, as in an inactive window
+    assert field.value() != 0.5
+    window.do("close")
+    assert field.value() == 0.5
+
+
 def test_only_the_visible_page_is_refreshed(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):

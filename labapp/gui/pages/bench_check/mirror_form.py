@@ -79,11 +79,6 @@ class MirrorForm(FieldForm):
         """All fields in order."""
         return self.kind, self.diameter, self.height_field, self.height_sigma, self.level
 
-    def flush(self) -> None:
-        """Finish an edit in progress."""
-        for field in (self.diameter, self.height_field, self.height_sigma, self.level):
-            field.flush()
-
     def show_mirror(self, one: Chosen | None, locked: str) -> None:
         """Show the mirror of a picture, or none. ``locked``: reason why changes are refused."""
         for field in self.fields:

@@ -246,10 +246,6 @@ class BenchCheckPage(Page):
         self.predicted.show_texts(() if made is None else made.rows)
         self.predicted.setVisible(made is not None)
 
-    def leave(self) -> None:
-        """Finish an edit in progress."""
-        self.mirror_form.flush()
-
     # --- the panel ----------------------------------------------------------------------------
 
     def _make_panel(self) -> None:

@@ -156,10 +156,6 @@ class PlanePage(Page):
         tip = "The target that is chosen at the right"
         return Lead(NO_PICTURE, (load, Offer("&Save for printing…", tip, self._choose_target)))
 
-    def leave(self) -> None:
-        """Finish an edit in progress."""
-        self.unit.flush()
-
     # --- the panel --------------------------------------------------------------------------
 
     def _make_panel(self) -> None:

@@ -135,15 +135,6 @@ class SetupPage(Page):
                 if sigma is not None:  # its label is not shown
                     self.sigma_fields[sigma.key].setVisible(kind in sigma.kinds)
 
-    def leave(self) -> None:
-        """Finish an edit in progress."""
-        numbers = (
-            *(*self.rig_fields.values(), *self.sigma_fields.values()),
-            *self.drawn_fields.values(),
-        )
-        for field in (*numbers, *self.record_fields.values()):
-            field.flush()
-
     def load(self, path: Path) -> None:
         """Load the setup from a file."""
         if self.workspace.attempt(
