@@ -11,7 +11,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.pages.setup import SetupPage
+from labapp.gui.pages.setup.page import SetupPage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import advising
 from labapp.gui.tools.adviser import AdviserWindow

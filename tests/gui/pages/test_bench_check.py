@@ -28,7 +28,8 @@ from labapp.core.geometry.uncertainty import INDEX
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.values import CannotMeasure
 from labapp.gui.digits import with_sigma
-from labapp.gui.pages.bench_check import BenchCheckPage, presenter
+from labapp.gui.pages.bench_check import presenter
+from labapp.gui.pages.bench_check.page import BenchCheckPage
 from labapp.gui.pages.bench_check.presenter import Checked, Chosen
 from labapp.gui.pages.setup import presenter as setup_presenter
 from labapp.gui.shell.steps import Mark, states

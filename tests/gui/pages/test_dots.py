@@ -17,8 +17,9 @@ from pytestqt.qtbot import QtBot
 from labapp.core.pipeline import start_correction
 from labapp.core.rows.correction import Correction, add_dot, delete_dots, shift_row
 from labapp.errors import InputError
-from labapp.gui.pages.dots import DotsPage, presenter
+from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.fitting import Processes, Refit
+from labapp.gui.pages.dots.page import DotsPage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tasks import Control
 from labapp.gui.workspace import Workspace

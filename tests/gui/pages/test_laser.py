@@ -12,7 +12,8 @@ from PySide6.QtCore import QItemSelectionModel, Qt
 from pytestqt.qtbot import QtBot
 
 from labapp.core.calibration.laser_calibration import calibrate_laser
-from labapp.gui.pages.laser import LaserPage, presenter
+from labapp.gui.pages.laser import presenter
+from labapp.gui.pages.laser.page import LaserPage
 from labapp.gui.pages.laser.presenter import ENDS, SCALE, Readings
 from labapp.gui.shell.steps import states
 from labapp.gui.workspace import Workspace
@@ -139,7 +140,7 @@ def fill(page: LaserPage, row: int, texts: tuple[str, ...]) -> None:
 
 
 def presenter_cell(text: str):
-    from labapp.gui.pages.laser.view import _cell
+    from labapp.gui.pages.laser.page import _cell
 
     return _cell(text)
 

@@ -14,9 +14,9 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QHBoxLayout, QWidget
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.dots.fitting import Processes, Refit
 from labapp.gui.pages.dots.lines import show_lines
+from labapp.gui.pages.dots.page import DotsPage
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT, SAMPLES, let_draw

@@ -27,8 +27,7 @@ from labapp.export.heights import profile, sigma_at
 from labapp.export.rendering.paper import Paper
 from labapp.export.rendering.scene import DIFFERENCE_MAP
 from labapp.export.rendering.studio import Studio
-from labapp.gui.pages.surface import SurfacePage
-from labapp.gui.pages.surface.view import FILM_PX
+from labapp.gui.pages.surface.page import FILM_PX, SurfacePage
 from labapp.gui.views.picture_files import PaperDialog, write_plot
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
