@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QVBoxLayout, QWidget
 from labapp.gui.shell.steps import Lead, State, read_only
 from labapp.gui.tasks import DONE, Task, Work
 from labapp.gui.widgets.fields import Field
-from labapp.gui.widgets.labels import Message
+from labapp.gui.widgets.labels import Message, allow
 from labapp.gui.widgets.layouts import vbox
 from labapp.gui.workspace import Workspace
 
@@ -100,8 +100,7 @@ class Page(QWidget):
             if isinstance(widget, Field):
                 widget.lock(why)
             else:
-                widget.setEnabled(not why)
-                widget.setToolTip(why or widget.property("usual tip"))
+                allow(widget, widget.property("usual tip"), why)
 
     def _take_session(self) -> None:
         """Clear messages about the previous session."""

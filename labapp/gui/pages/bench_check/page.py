@@ -27,7 +27,7 @@ from labapp.gui.tasks import Control
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField
-from labapp.gui.widgets.labels import Message, heading, plain_tip, show_words, wrapping_label
+from labapp.gui.widgets.labels import Message, allow, heading, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.tables import FullTable, ReadTable
 from labapp.gui.workspace import Workspace
@@ -181,10 +181,8 @@ class BenchCheckPage(Page):
         if dropped:
             self.checked = None
             self.answer.setText("")
-        self.list.setRowCount(len(chosen))
-        for row, one in enumerate(chosen):
-            for column, text in enumerate((f"{row + 1}  {one.name}", one.mirror_words)):
-                self.list.set_cell(row, column, text, number=False)
+        texts = [(f"{n}  {one.name}", one.mirror_words) for n, one in enumerate(chosen, 1)]
+        self.list.show_texts(texts, words=(0, 1))
         if chosen:
             self.list.selectRow(min(at, len(chosen) - 1))
         if dropped:
@@ -254,20 +252,17 @@ class BenchCheckPage(Page):
         self.predicted = FullTable(
             name, f"{name}: Ctrl+C copies it", ("After a check with", "±, mm")
         )
-        self.predicted.offer(("Copy table", self.predicted.copy_text))
         self.predicted_words = wrapping_label()
         tip = "Add pictures of a mirror's dots, taken by the camera in its place"
         self.add_button = button("Add picture…", tip, self._choose)
         self.remove_button = button("Remove", "Remove the picture from the list", self.remove)
-        self.list = ReadTable("Pictures of mirrors", "Pictures and the mirrors that they show")
-        self.list.setColumnCount(2)
-        self.list.setHorizontalHeaderLabels(["Picture", "Mirror"])
+        tip = "Pictures and the mirrors that they show"
+        self.list = ReadTable("Pictures of mirrors", tip, ("Picture", "Mirror"))
         self.list.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
         self.list.horizontalHeader().setSectionResizeMode(1, QHeaderView.ResizeMode.Stretch)
         self.list.itemSelectionChanged.connect(self._follow)
         self.list.verticalHeader().setDefaultSectionSize(ROW_PX)
         self.list.setFixedHeight(ROW_PX * (LIST_ROWS + 1) + 8)
-        self.list.offer(("Copy table", self.list.copy_text))
         self.mirror_form = MirrorForm(self._selected, self.change)
         self.kind, self.diameter = self.mirror_form.kind, self.mirror_form.diameter
         self.height_field = self.mirror_form.height_field
@@ -281,7 +276,6 @@ class BenchCheckPage(Page):
             "Ctrl+C copies the table"
         )
         self.mirrors = FullTable("Known mirrors, measured", tip, presenter.MIRROR_COLUMNS)
-        self.mirrors.offer(("Copy table", self.mirrors.copy_text))
         fill(
             self.panel_layout,
             *(self.predict_button, self.predicted_words, self.predicted),
@@ -354,7 +348,7 @@ class BenchCheckPage(Page):
         wrong = next((one.problem for one in self.chosen if one.problem), "")
         why_not = lacking or wrong or ("" if self.chosen else "Add a picture of a mirror first")
         tip = "Find the dots' rays and adjust the set-up to the known mirrors"
-        self._let(self.check_button, why_not, tip)
+        allow(self.check_button, tip, why_not)
         made = self.checked
         if used:
             unusable = "It is in use"
@@ -363,19 +357,11 @@ class BenchCheckPage(Page):
         else:
             unusable = "" if made.usable else "What is wrong must be corrected first"
         tip = "Measure with the adjusted set-up; undo restores the former one"
-        self._let(self.use_button, self.locked or unusable, tip)
+        allow(self.use_button, tip, self.locked or unusable)
         tip = "Predicted ± of the height of the expected pool, after each set of pictures"
-        self._let(self.predict_button, lacking, tip)
-        self._let(
-            self.remove_button,
-            self.locked or ("" if self.chosen else "No picture"),
-            "Remove it from the list",
-        )
-
-    @staticmethod
-    def _let(pressed: QWidget, why_not: str, tip: str) -> None:
-        pressed.setEnabled(not why_not)
-        pressed.setToolTip(plain_tip(why_not or tip))
+        allow(self.predict_button, tip, lacking)
+        why_not = self.locked or ("" if self.chosen else "No picture")
+        allow(self.remove_button, "Remove it from the list", why_not)
 
     def _show_picture(self, found: MirrorPicture | None) -> None:
         image = self._selected().image if self.chosen else None
@@ -425,7 +411,6 @@ class _QuantityTable(ReadTable):
         self._narrowed = QTimer(self, singleShot=True, interval=0)
         self._narrowed.timeout.connect(self._fit_names)
         self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
-        self.offer(("Copy table", self.copy_text))
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Use the remaining width for the names, but at least the width for two lines."""

@@ -130,10 +130,7 @@ class LineList(ReadTable):
 
     def show_lines(self, listed: tuple[tuple[str, ...], ...]) -> None:
         """Show the rows of the lines."""
-        self.setRowCount(len(listed))
-        for k, cells in enumerate(listed):
-            for column, text in enumerate(cells):
-                self.set_cell(k, column, text, number=column < len(cells) - 1, tip=text)
+        self.show_texts(listed, words=(len(COLUMNS) - 1,))
         self.setFixedHeight(self.full_height)
 
     @property

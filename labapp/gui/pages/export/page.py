@@ -33,7 +33,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.tasks import DONE, PROBLEM, Control, Task
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, whole
-from labapp.gui.widgets.labels import Message, heading, keep_room, plain_tip, wrapping_label
+from labapp.gui.widgets.labels import Message, allow, heading, keep_room, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox, scrolled, vbox
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
@@ -120,12 +120,8 @@ class ExportPage(Page):
         writing = self._writing in active
         measuring = self.workspace.measuring is not None
         why_not = "Writing…" if writing else made.why_not
-        self.export_button.setEnabled(not why_not)
-        self.export_button.setToolTip(
-            plain_tip(
-                why_not or "Write all that is ticked; a cancelled export leaves nothing behind"
-            )
-        )
+        tip = "Write all that is ticked; a cancelled export leaves nothing behind"
+        allow(self.export_button, tip, why_not)
         recording = self.workspace.session.recording
         size = estimated_bytes(
             self.request,
