@@ -400,7 +400,7 @@ def test_rejected_edit_is_reported_and_changes_nothing(
     page.editor.choose_rows([4])
     page.dots_panel.row.edited.emit(5)  # occupied by other dots
     assert [problem for _, problem in messages] == [True] * 6
-    assert "no dot is selected" in messages[0][0]
+    assert "Select a dot first" in messages[0][0]
     assert "already assigned" in messages[-1][0]
     assert len(session.history) == steps
     assert unfitted == []
@@ -549,7 +549,7 @@ def test_presenter_of_a_session(copy_sample: CopySample) -> None:
     with Session.open(copy_sample("blocked_rows")) as session:
         shown = presenter.shown(session, 0, None)
         assert shown.origin == "measured"
-        assert presenter.wanted(session, 0) is None
+        assert not presenter.needs_dots(session, 0)
         assert shown.correction is not None
         # Computed dots agree with the captured ones, because the surface fits.
         distances = np.linalg.norm(

@@ -74,9 +74,10 @@ class DotsPage(Page):
         self._lines_frame = -1
         self._in_view = False
         self._unmet: dict[str, str] = {}
-        self._needs = {c.text: c.needs for c in (*self._edits(), *self._frame_commands())}
+        needing = (*self._edits(), *self._frame_commands(), *(c for c in self._keys() if c.needs))
+        self._needs = {command.text: command.needs for command in needing}
         edits, frames, keys = (
-            [self.action(*command[:4]) for command in commands]
+            [self.action(c.text, c.key, c.tip, partial(self._run, c)) for c in commands]
             for commands in (self._edits(), self._frame_commands(), self._keys())
         )
         self._dot_actions = [*edits, *frames, *keys]
@@ -336,18 +337,9 @@ class DotsPage(Page):
             self.draw()
 
     def _carry_on(self) -> None:
-        seen = self.seen
-        if seen is None or seen.correction is None:
-            self.workspace.notified.emit("There are no dots yet to carry on", True)
-            return
+        assert self.seen is not None
         most = self.dots_panel.most.value()
-        carry_on(self, seen, None if most is None else int(most), self.dots_panel.carried)
-
-    def _automatic(self) -> None:
-        if self.seen is not None and self.seen.origin != "corrected":
-            self.workspace.notified.emit(presenter.UNMET["corrected"], False)
-        else:
-            self.editor.back_to_automatic()
+        carry_on(self, self.seen, None if most is None else int(most), self.dots_panel.carried)
 
     def _escape(self) -> None:
         if self.hand.busy:
@@ -357,10 +349,7 @@ class DotsPage(Page):
         self.draw()
 
     def _type_row(self) -> None:
-        if why := self._unmet.get("Delete", ""):  # which has the same need
-            self.workspace.notified.emit(why, True)
-        else:
-            self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
+        self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
 
     # --- keys and buttons ---------------------------------------------------------------------
 
@@ -377,6 +366,13 @@ class DotsPage(Page):
         for widget in (self, self.panel):
             widget.addAction(action)
         return action
+
+    def _run(self, command: Command) -> None:
+        """Run a command, or report what it needs."""
+        if why := self._unmet.get(command.text, ""):
+            self.workspace.notified.emit(why, True)
+        else:
+            command.do()
 
     def _edits(self) -> tuple[Command, ...]:
         editor = self.editor
@@ -419,7 +415,7 @@ class DotsPage(Page):
             Command("Carry on", "Ctrl+Return", "Apply these dots and rows to the following frames "
                     "by tracking, until they no longer fit", self._carry_on, "rows"),
             Command("Back to automatic", "Ctrl+Backspace", "Discard the corrections of this frame",
-                    self._automatic, "corrected"),
+                    self.editor.back_to_automatic, "corrected"),
         )  # fmt: skip
 
     def _keys(self) -> tuple[Command, ...]:
@@ -436,7 +432,7 @@ class DotsPage(Page):
                     lambda: self.choose(editor.choose_next, -1)),
             Command("Whole row", "W", "Select all dots in the rows of the selected ones",
                     lambda: self.choose(editor.choose_rows, editor.rows)),
-            Command("Type a row", "T", "Type the row of the selected dots", self._type_row),
+            Command("Type a row", "T", "Type the row of the selected dots", self._type_row, "dots"),
             Command("Hide marks", "H", "Hide the marks, or show them again",
                     self.overlay.toggle),
         )  # fmt: skip
