@@ -123,10 +123,10 @@ def test_check_finds_deviations_and_undetermined_quantities(checked: Checked) ->
     assert len(rows) == uncertain.sum() == len(INDEX) - 2  # there is no glass
     assert ("Imaging plane", "s") in rows
     rotation = rows["Pattern", "Rotation"]
-    assert rotation.determined
+    assert rotation.texts[-1] == presenter.DETERMINED
     assert rotation.texts[-1] == presenter.DETERMINED
     assert " ± " in rotation.texts[2]
-    undetermined = {name for name, row in rows.items() if not row.determined}
+    undetermined = {name for name, row in rows.items() if row.texts[-1] == presenter.NOT_DETERMINED}
     share = record.after_sigma[uncertain] / record.before_sigma[uncertain]
     assert len(undetermined) == (share > 0.8).sum() > 0
 

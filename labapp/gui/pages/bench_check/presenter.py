@@ -256,7 +256,6 @@ class QuantityRow:
     """Object to which the quantity belongs."""
     texts: tuple[str, str, str, str, str]
     """Name, value ± before, value ± after, unit, and whether the pictures determine it."""
-    determined: bool
 
 
 COLUMNS = ("Quantity", "Before", "After", "Unit", "")
@@ -293,7 +292,7 @@ def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
             one.unit,
             DETERMINED if determined else NOT_DETERMINED,
         )
-        rows.append(QuantityRow(_sentence(group, ""), texts, determined))
+        rows.append(QuantityRow(_sentence(group, ""), texts))
     groups = list(dict.fromkeys(row.group for row in rows))  # later quantities join their group
     return tuple(sorted(rows, key=lambda row: groups.index(row.group)))
 

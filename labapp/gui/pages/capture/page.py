@@ -174,7 +174,7 @@ class CapturePage(Page):
             self.confirm(kept_text(take, why_kept))
         else:
             measured = self.live_view.plan_fields.measured.isChecked()
-            self._import(take.path, ":", None, False, self._measure if measured else _nothing)
+            self._import(take.path, None, self._measure if measured else _nothing)
 
     def _show_recording(self, recording: Recording | None) -> None:
         self.facts_group.setVisible(recording is not None and self.live_view.live is None)
@@ -304,7 +304,7 @@ class CapturePage(Page):
             self.chosen.begin(preview)
             self._look()
             if at_once:
-                self._import(path, ":", None, False, self._go_to_dots)
+                self._import(path, None, self._go_to_dots)
             self._show_import()
             self.workspace.changed.emit()
 
@@ -320,34 +320,29 @@ class CapturePage(Page):
         """Import the chosen frames in the background."""
         preview, choice = self.preview, self.choice()
         if preview is not None and choice is not None and choice.count:
-            self._import(preview.path, choice.frames, choice.rate_hz, choice.embed)
+            self._import(preview.path, choice)
 
     def begin_next(self) -> None:
         """Import the chosen frames into a new session with the same set-up."""
         preview, choice = self.preview, self.choice()
         if preview is not None and choice is not None and choice.count:
-            self._import_next(preview.path, choice.frames, choice.rate_hz, choice.embed)
+            self._import_next(preview.path, choice)
 
-    def _import_next(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
+    def _import_next(self, path: Path, choice: Choice | None) -> None:
         former = self.workspace.session
         self.workspace.next_session_requested.emit(path)
         if self.workspace.session is not former:  # the dialog was not cancelled
-            self._import(path, frames, rate_hz, embed)
+            self._import(path, choice)
 
     def _import(
-        self,
-        path: Path,
-        frames: str,
-        rate_hz: float | None,
-        embed: bool,
-        then: Callable[[], None] = _nothing,
+        self, path: Path, choice: Choice | None, then: Callable[[], None] = _nothing
     ) -> None:
+        """Import the chosen frames of a recording in the background; None: all of them."""
         session = self.session
+        options = {} if choice is None else choice.options
 
         def work(control: Control) -> Recording:
-            recording = session.import_recording(
-                path, frames, frame_rate_hz=rate_hz, embed=embed, progress=control.progress
-            )
+            recording = session.import_recording(path, **options, progress=control.progress)
             session.overview()  # read in this thread: the window would wait for it
             return recording
 
@@ -438,9 +433,7 @@ class CapturePage(Page):
         keep_room(self.exposure)
         self.foot_switch = FootSwitchPanel(self.workspace.foot_switches)
         # Below the other buttons, as it appears when a recording ends.
-        self.kept = KeptRecordings(
-            self.take, lambda path: self._import_next(path, ":", None, False)
-        )
+        self.kept = KeptRecordings(self.take, lambda path: self._import_next(path, None))
         self.facts = QGridLayout()  # a form layout keeps old heights, which cuts off lines
         self.facts.setColumnStretch(1, 1)
         self.facts_group = Group("What was read", self.facts)

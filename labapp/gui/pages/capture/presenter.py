@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from labapp.core.images.exposure import Exposure, judge_exposure
 from labapp.core.images.find_dots import DotSettings, find_dots
@@ -104,9 +105,10 @@ class Choice:
     """Whether the frames are stored in the session."""
 
     @property
-    def frames(self) -> str:
-        """The frames in the form required by `Session.import_recording`."""
-        return f"{self.first}:{self.last + 1}:{self.every}"
+    def options(self) -> dict[str, Any]:
+        """The choice as arguments of `Session.import_recording`."""
+        frames = f"{self.first}:{self.last + 1}:{self.every}"
+        return {"frames": frames, "frame_rate_hz": self.rate_hz, "embed": self.embed}
 
     @property
     def count(self) -> int:

@@ -37,7 +37,7 @@ from labapp.text import local_time
 
 ENTRIES = {entry.key: entry for _, entries in RIG for entry in entries}
 
-EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB, STEPS_TAB = range(4)
+EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB = range(3)
 
 
 class SetupPage(Page):

@@ -18,7 +18,7 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.heights import Profile
 from labapp.export.rendering.scene import Colour, Scene, rays_of, scene_of
-from labapp.gui.digits import ResultRow
+from labapp.gui.digits import ResultRow, round_factor
 from labapp.session.results.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
 from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, local_time, marked_setup_words, setup_words
@@ -350,5 +350,4 @@ def error_scale(captured: FloatArray, computed: FloatArray) -> float:
         return 1.0
     longest = float(np.fmax.reduce(np.linalg.norm(computed - captured, axis=1), initial=0.0))
     wanted = 0.1 * float(np.ptp(captured, axis=0).max()) / max(longest, 1e-9)
-    steps = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0])
-    return float(steps[max(int(np.searchsorted(steps, wanted, side="right")) - 1, 0)])
+    return round_factor(min(max(wanted, 1.0), 1000.0))
