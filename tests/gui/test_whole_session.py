@@ -148,7 +148,7 @@ def correct(hand: Hand, qtbot: QtBot) -> None:
     hand.press(Qt.Key.Key_Escape)  # the click may have selected a dot, which the arrow would move
     hand.press(Qt.Key.Key_Right)
     assert hand.window.workspace.frame == CORRECTED
-    qtbot.waitUntil(lambda: dots.looking.frame == CORRECTED and dots.editor.correction is not None)
+    qtbot.waitUntil(lambda: dots.reader.frame == CORRECTED and dots.editor.correction is not None)
     port = dots.view.canvas.viewport()
     hand.click(port, hand.point(dots.view, *place_of(MOVED)))
     for key in (Qt.Key.Key_Right, Qt.Key.Key_Down, Qt.Key.Key_Down):

@@ -250,9 +250,9 @@ def _surface(hands: Hands) -> None:
     hands.enter("Heights ×", "1")
     show = hands.find(QToolButton, "Show", QToolButton.text)
     hands.popup(show.menu(), "show", show.showMenu)
-    page.parts["rays"].trigger()
+    page.drawn_items["rays"].trigger()
     hands.picture("rays")
-    page.parts["rays"].trigger()
+    page.drawn_items["rays"].trigger()
     hands.answer_dialog("save-picture", lambda: hands.press("Save…"))
     hands.answer_dialog("save-copy", lambda: hands.do("copy"))
 

@@ -69,7 +69,7 @@ def show(page: DotsPage, qtbot: QtBot, path: Path, frame: int) -> Session:
     page.workspace.show_frame(frame)
     session = page.workspace.session
     assert session is not None
-    qtbot.waitUntil(lambda: page.looking.frame == frame and page.editor.correction is not None)
+    qtbot.waitUntil(lambda: page.reader.frame == frame and page.editor.correction is not None)
     let_draw()
     return session
 
@@ -604,8 +604,8 @@ def test_fast_frame_changes_show_matching_dots(
     qtbot.waitUntil(lambda: page.seen is not None and page.seen.frame == numbers[-1])
     # The results have other settings, so dots are detected once, at the end.
     qtbot.waitUntil(lambda: origin(page) == "found")
-    assert page.looking.found is not None
-    assert page.looking.found.frame == numbers[-1]
+    assert page.reader.found is not None
+    assert page.reader.found.frame == numbers[-1]
 
 
 def test_damaged_result_is_reported_and_dots_are_detected(

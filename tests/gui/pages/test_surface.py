@@ -183,12 +183,12 @@ def button(page: QWidget, words: str) -> QAbstractButton:
 
 def test_parts_of_the_view_can_be_toggled(page: SurfacePage) -> None:
     assert page.view.scene.rays_mm == {}
-    page.parts["rays"].trigger()
+    page.drawn_items["rays"].trigger()
     assert len(page.view.scene.rays_mm["reflected"]) == len(page.view.scene.points_mm)
-    page.parts["points"].trigger()
+    page.drawn_items["points"].trigger()
     assert len(page.view.scene.points_mm) == 0
     frame_limits = page.view.scene.limits
-    page.parts["same_colours"].trigger()
+    page.drawn_items["same_colours"].trigger()
     assert page.view.scene.limits[1] > frame_limits[1]
     page.colour.edited.emit("sigma")
     assert page.view.scene.label == "± height (mm)"

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from labapp.core.bench_check.mirrors import Plate
-from labapp.gui.pages.bench_check.chosen import KINDS, Chosen
+from labapp.gui.pages.bench_check.listed_picture import KINDS, ListedPicture
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 
 
@@ -21,7 +21,9 @@ class MirrorForm(FieldForm):
         Called with the picture when its mirror was changed.
     """
 
-    def __init__(self, selected: Callable[[], Chosen], change: Callable[[Chosen], object]) -> None:
+    def __init__(
+        self, selected: Callable[[], ListedPicture], change: Callable[[ListedPicture], object]
+    ) -> None:
         super().__init__()
         tip = "Which mirror the selected picture shows"
         self.kind = ChoiceField("Mirror", KINDS, tooltip=tip)
@@ -79,7 +81,7 @@ class MirrorForm(FieldForm):
         """All fields in order."""
         return self.kind, self.diameter, self.height_field, self.height_sigma, self.level
 
-    def show_mirror(self, one: Chosen | None, locked: str) -> None:
+    def show_mirror(self, one: ListedPicture | None, locked: str) -> None:
         """Show the mirror of a picture, or none. ``locked``: reason why changes are refused."""
         for field in self.fields:
             field.lock(locked or ("" if one else "Add a picture first"))

@@ -18,9 +18,9 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.bench_check import presenter
-from labapp.gui.pages.bench_check.chosen import Chosen, kept_pictures
+from labapp.gui.pages.bench_check.listed_picture import ListedPicture, kept_pictures
 from labapp.gui.pages.bench_check.mirror_form import MirrorForm
-from labapp.gui.pages.bench_check.presenter import COLUMNS, Checked, Predicted
+from labapp.gui.pages.bench_check.presenter import COLUMNS, CheckResult, Predicted
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import Lead, Mark, Offer, State, setup_to_do
 from labapp.gui.tasks import Control
@@ -52,8 +52,8 @@ class BenchCheckPage(Page):
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
-        self.chosen: list[Chosen] = []
-        self.checked: Checked | None = None
+        self.chosen: list[ListedPicture] = []
+        self.checked: CheckResult | None = None
         self.answer = Message(4)
         self._path: Path | None = None
         self._kept: BenchCheckRecord | None = None
@@ -65,7 +65,7 @@ class BenchCheckPage(Page):
         self.quantities = _QuantityTable()
         left, self.found = QWidget(), QWidget()
         vbox((self.view, 1), self.legend, self.pointed, of=left)
-        vbox((self.quantities, 1), wrapping_label(presenter.KEY), of=self.found)
+        vbox((self.quantities, 1), wrapping_label(presenter.LEGEND), of=self.found)
         self.splitter = QSplitter(Qt.Orientation.Horizontal)
         self.splitter.setChildrenCollapsible(False)
         self.splitter.addWidget(left)
@@ -131,7 +131,7 @@ class BenchCheckPage(Page):
     def _take_kept(self) -> None:
         session, kept = self.session, self._kept
 
-        def shown(chosen: Sequence[Chosen]) -> None:
+        def shown(chosen: Sequence[ListedPicture]) -> None:
             if session.bench_check is kept:
                 self._list(chosen)
 
@@ -143,12 +143,12 @@ class BenchCheckPage(Page):
     def load(self, *paths: Path) -> None:
         """Add pictures, initially of a plate."""
 
-        def loaded(pictures: Sequence[Chosen]) -> None:
+        def loaded(pictures: Sequence[ListedPicture]) -> None:
             self._list([*self.chosen, *pictures], len(self.chosen))
 
         self.start_task(
             "Loading the picture",
-            lambda _: [Chosen(path.name, read_picture(path)) for path in paths],
+            lambda _: [ListedPicture(path.name, read_picture(path)) for path in paths],
             loaded,
         )
 
@@ -166,7 +166,7 @@ class BenchCheckPage(Page):
             at = self._at()
             self._list([one for k, one in enumerate(self.chosen) if k != at], max(0, at - 1))
 
-    def change(self, one: Chosen) -> None:
+    def change(self, one: ListedPicture) -> None:
         """Change the mirror of the selected picture."""
         at = self._at()
         self._list([one if k == at else other for k, other in enumerate(self.chosen)], at)
@@ -174,7 +174,7 @@ class BenchCheckPage(Page):
     def _at(self) -> int:
         return max(0, min(self.list.currentRow(), len(self.chosen) - 1))
 
-    def _list(self, chosen: Sequence[Chosen], at: int = 0) -> None:
+    def _list(self, chosen: Sequence[ListedPicture], at: int = 0) -> None:
         """Show a list of pictures; results of another list are discarded."""
         self.chosen = list(chosen)
         dropped = self.checked is not None and self.checked.chosen != tuple(chosen)
@@ -199,11 +199,11 @@ class BenchCheckPage(Page):
         text, path, settings = session.setup_text, session.path, session.settings.dots
         pool = presenter.expected_pool(session.record)
 
-        def work(control: Control) -> Checked:
+        def work(control: Control) -> CheckResult:
             presenter.check_sizes(session, chosen)
             return presenter.check(chosen, (text, path), settings, control.progress, free, pool)
 
-        def found(made: Checked) -> None:
+        def found(made: CheckResult) -> None:
             if tuple(self.chosen) == chosen:
                 self.checked = made
                 self.workspace.changed.emit()
@@ -300,7 +300,7 @@ class BenchCheckPage(Page):
         if path := ask_file(self, "Picture of a mirror", self.workspace.folder):
             self.load(path)
 
-    def _selected(self) -> Chosen:
+    def _selected(self) -> ListedPicture:
         return self.chosen[self._at()]
 
     # --- what is shown ------------------------------------------------------------------------
@@ -434,7 +434,7 @@ class _QuantityTable(ReadTable):
             at = self.rowCount()
             self.setRowCount(at + 1)
             for column, text in enumerate(row.texts):
-                tip = presenter.KEY if column == len(row.texts) - 1 else ""
+                tip = presenter.LEGEND if column == len(row.texts) - 1 else ""
                 self.set_cell(at, column, text, number=column in (1, 2), tip=tip)
         self.resizeRowsToContents()
 

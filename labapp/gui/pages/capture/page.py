@@ -18,7 +18,7 @@ from labapp.gui.pages.capture.kept_recordings import KeptRecordings, kept_text
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
-    Seen,
+    ShownFrame,
     look,
     missing_text,
     recording_facts,
@@ -154,7 +154,7 @@ class CapturePage(Page):
             self.exposure.hide()
         else:
             self._drop_preview()
-            self._show_seen(Seen(f"Live: {live.name}", None, None, "Opening the camera…"))
+            self._show_seen(ShownFrame(f"Live: {live.name}", None, None, "Opening the camera…"))
         self.refresh()
         self.workspace.changed.emit()
 
@@ -212,7 +212,7 @@ class CapturePage(Page):
             self._listed = session
             self.kept.list_beside(session, self.live_view.recording)
 
-    def _show_seen(self, seen: Seen) -> None:
+    def _show_seen(self, seen: ShownFrame) -> None:
         self.title.setText(seen.title)
         self.picture_view.show_picture(seen.image, seen.words)
         if seen.exposure is None:
@@ -237,7 +237,7 @@ class CapturePage(Page):
             self._wanted = (None, self.workspace.frame)
         else:
             self._wanted = self._seen = None
-            self._show_seen(Seen("", None, None))
+            self._show_seen(ShownFrame("", None, None))
             return
         if self._wanted != self._seen and self._reading not in self.workspace.tasks.active:
             self._read()
@@ -253,12 +253,12 @@ class CapturePage(Page):
             return
         preview, number = wanted
 
-        def work(_: Control) -> Seen:
+        def work(_: Control) -> ShownFrame:
             if preview is not None:
                 return preview.look(number, session.settings.dots if judged else None)
             return look(session, number, judged)
 
-        def done(seen: Seen) -> None:
+        def done(seen: ShownFrame) -> None:
             if self.workspace.session is not session or self.live_view.live is not None:
                 return
             self._seen = wanted

@@ -20,7 +20,7 @@ from labapp.text import format_bytes, local_time
 
 
 @dataclass(frozen=True)
-class Seen:
+class ShownFrame:
     """A frame to show."""
 
     title: str
@@ -50,16 +50,16 @@ class Preview:
         self.description = self._source.description
         self.warnings = self._source.warnings
 
-    def look(self, number: int, settings: DotSettings | None) -> Seen:
+    def look(self, number: int, settings: DotSettings | None) -> ShownFrame:
         """Read a frame, and assess its exposure if there are settings to find dots."""
         title = f"{self.path.name}, frame {number} (of 0 to {self.frames - 1}), not imported yet"
         with self._turn:
             try:
                 image = self._source.frame(number).image
             except InputError as error:
-                return Seen(title, None, None, str(error))
+                return ShownFrame(title, None, None, str(error))
             depth = self._source.bit_depth
-        return Seen(title, image, _judged(image, settings, depth))
+        return ShownFrame(title, image, _judged(image, settings, depth))
 
     def close(self) -> None:
         """Close the file."""
@@ -67,16 +67,18 @@ class Preview:
             self._source.close()
 
 
-def look(session: Session, number: int, judged: bool = True) -> Seen:
+def look(session: Session, number: int, judged: bool = True) -> ShownFrame:
     """Read a frame of the session and, if ``judged``, assess its exposure."""
     recording = session.recording
     title = f"Frame {number} of the session"
     try:
         image = session.frame(number).image
     except InputError as error:
-        return Seen(title, None, None, recording_gone(session) or str(error))
+        return ShownFrame(title, None, None, recording_gone(session) or str(error))
     depth = None if recording is None else recording.bit_depth
-    return Seen(title, image, _judged(image, session.settings.dots if judged else None, depth))
+    return ShownFrame(
+        title, image, _judged(image, session.settings.dots if judged else None, depth)
+    )
 
 
 def _judged(

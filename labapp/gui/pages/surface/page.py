@@ -250,13 +250,13 @@ class SurfacePage(Page):
     def _parts_button(self) -> QToolButton:
         menu = QMenu(self)
         menu.setToolTipsVisible(True)
-        self.parts: dict[str, QAction] = {}
+        self.drawn_items: dict[str, QAction] = {}
         for name, (words, what) in SHOWN_PARTS.items():
             action = menu.addAction(words)
             action.setCheckable(True)
             action.setToolTip(what)
             action.toggled.connect(lambda ticked, name=name: self._set(**{name: ticked}))
-            self.parts[name] = action
+            self.drawn_items[name] = action
         button = tool_button("Show", "Choose what the 3-D view shows", lambda: None)
         button.setMenu(menu)
         button.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
@@ -381,7 +381,7 @@ class SurfacePage(Page):
         self._exaggerated = high if high != 1.0 else self._exaggerated
         self.high.set_value(high)
         self.true_scale.setChecked(high == 1.0)
-        for name, action in self.parts.items():
+        for name, action in self.drawn_items.items():
             action.blockSignals(True)
             action.setChecked(getattr(self.options, name))
             action.blockSignals(False)

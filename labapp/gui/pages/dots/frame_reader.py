@@ -18,7 +18,7 @@ REST_MS = 120
 """Time, ms, that a frame stays in view before its dots are detected."""
 
 
-class Looking(QObject):
+class FrameReader(QObject):
     """Reads the frame in view, and detects its dots if the session has none.
 
     One task runs at a time; when it ends, the last request is processed.

@@ -15,7 +15,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QHeaderView, QToolButton, QWidget
 
-from labapp.gui.pages.dots.lines import COLUMNS, DrawnLine, LinesState
+from labapp.gui.pages.dots.line_presenter import COLUMNS, DrawnLine, LinesState
 from labapp.gui.pages.dots.overlay import cosmetic_pen, row_color
 from labapp.gui.pages.dots.panel import button_grid
 from labapp.gui.views.picture import PictureView
