@@ -86,6 +86,12 @@ class Page(QWidget):
         self._answers.add(message)
         return message
 
+    def change_when_edited(self, field: Field, change: Callable[[Session, Any], object]) -> None:
+        """Change the session by a function of it and the new value when a field is edited."""
+        field.edited.connect(
+            lambda value: self.workspace.attempt(lambda session: change(session, value))
+        )
+
     def lock_with_session(self, *widgets: QWidget) -> None:
         """Disable these widgets, which change the session, while it is open read-only."""
         self._changing += widgets

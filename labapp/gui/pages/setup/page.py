@@ -47,9 +47,7 @@ class SetupPage(Page):
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
-        self.drawn_fields = {key: _number(ENTRIES[key]) for key in DRAWN}
-        for key, field in self.drawn_fields.items():
-            self._put_when_edited(field, key)
+        self.drawn_fields = {key: self._put_field(ENTRIES[key]) for key in DRAWN}
         self.bench = BenchView(self.drawn_fields)
         self.canvas_layout.addWidget(self.bench)
         self.rig_fields: dict[str, NumberField] = {}
@@ -165,10 +163,8 @@ class SetupPage(Page):
         else:
             lines = 4 if entry.key == "notes" else 1
             field = TextField(entry.label, tooltip=entry.tooltip, lines=lines)
-        field.edited.connect(
-            lambda value: self.workspace.attempt(
-                lambda session: presenter.note(session, entry.key, value)
-            )
+        self.change_when_edited(
+            field, lambda session, value: presenter.note(session, entry.key, value)
         )
         self.record_fields[entry.key] = field
         form.add(field)
@@ -227,7 +223,9 @@ class SetupPage(Page):
                 self.pattern = PatternView()
                 form.add_wide(self.pattern)
             for entry in entries:
-                form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
+                field = self.rig_fields[entry.key] = self._put_field(entry)
+                sigma = presenter.sigma_entry(entry)
+                form.add(field, None if sigma is None else self._sigma_field(sigma))
             if title == "Torch":
                 tip = "Where the pool's head is: +Y is the laser's side. The rear may lie lower"
                 self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)
@@ -235,9 +233,7 @@ class SetupPage(Page):
         title, entries = UNCERTAIN_ONLY
         form.add_heading(f"{title}, ±")
         for entry in entries:
-            field = self._sigma_field(entry)
-            assert field is not None
-            form.add(field)
+            form.add(self._sigma_field(entry))
         form.add_heading("Expected pool")
         for entry in POOL:
             self._add_noted(form, entry)
@@ -262,27 +258,20 @@ class SetupPage(Page):
         put: Callable[[Session, str], None],
     ) -> ChoiceField:
         field = ChoiceField(label, options, tooltip=tooltip)
-        field.edited.connect(
-            lambda value: self.workspace.attempt(lambda session: put(session, value))
+        self.change_when_edited(field, put)
+        return field
+
+    def _put_field(self, entry: Entry) -> NumberField:
+        """A field that enters its number in the set-up."""
+        field = _number(entry)
+        self.change_when_edited(
+            field, lambda session, value: presenter.put(session, entry.key, value)
         )
         return field
 
-    def _rig_field(self, entry: Entry) -> NumberField:
-        field = self.rig_fields[entry.key] = _number(entry)
-        self._put_when_edited(field, entry.key)
+    def _sigma_field(self, entry: Entry) -> NumberField:
+        field = self.sigma_fields[entry.key] = self._put_field(entry)
         return field
-
-    def _sigma_field(self, entry: Entry | None) -> NumberField | None:
-        if entry is None:
-            return None
-        field = self.sigma_fields[entry.key] = _number(entry)
-        self._put_when_edited(field, entry.key)
-        return field
-
-    def _put_when_edited(self, field: NumberField, key: str) -> None:
-        field.edited.connect(
-            lambda value: self.workspace.attempt(lambda session: presenter.put(session, key, value))
-        )
 
     def _use_defaults(self) -> None:
         if self.workspace.attempt(presenter.put_usual, beside=self.answer.setText):
