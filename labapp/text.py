@@ -60,6 +60,11 @@ def now() -> str:
     return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
+def local_time(iso: str) -> str:
+    """Return an ISO 8601 time as local date and time, to the minute: "2024-05-01 10:00"."""
+    return f"{datetime.fromisoformat(iso).astimezone():%Y-%m-%d %H:%M}"
+
+
 def pluralize(count: int, noun: str) -> str:
     """Return count and noun, in the plural unless the count is 1: "1 frame", "2 frames"."""
     return f"{count} {noun}{'s' * (count != 1)}"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from labapp.export.folder import verify_export
-from labapp.gui.pages import PAGES
+from labapp.gui.shell.steps import STEPS
 from tests.waiting import PATIENCE_S
 
 ELSEWHERE = Path(__file__).parent / "elsewhere"
@@ -37,5 +37,5 @@ def test_complete_workflow_on_other_systems(system: str, tmp_path: Path) -> None
     )
     assert process.returncode == 0, f"{process.stdout[-500:]}\n{process.stderr[-3000:]}"
     assert f"{system}: every module is imported" in process.stdout
-    assert f"pages: {' '.join(sorted(PAGES))}" in process.stdout
+    assert f"pages: {' '.join(sorted(step.key for step in STEPS))}" in process.stdout
     assert verify_export(tmp_path / "bench" / "results") == []

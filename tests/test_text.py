@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
+
 import pytest
 
-from labapp.text import SETUP_MARKS, SETUP_WORDS, marked_setup_words, setup_words, split_unit
+from labapp.text import (
+    SETUP_MARKS,
+    SETUP_WORDS,
+    local_time,
+    marked_setup_words,
+    setup_words,
+    split_unit,
+)
 
 CHECK = "2026-01-31T12:00:00+00:00"
 
@@ -25,6 +34,13 @@ def test_only_a_setup_changed_after_its_check_is_described_so(status: str):
     changed = setup_words(status, was_checked=CHECK) != setup_words(status)
     assert changed == (status in ("entered", "calibrated"))
     assert (CHECK[:10] in setup_words(status, was_checked=CHECK)) == changed
+
+
+@pytest.mark.parametrize("iso", ["2024-05-01T15:00:59+00:00", "2024-05-01T10:00:59-05:00"])
+def test_time_is_shown_in_the_local_time_zone_to_the_minute(iso: str) -> None:
+    here = datetime(2024, 5, 1, 15, tzinfo=UTC).astimezone()
+    assert local_time(iso) == here.replace(tzinfo=None).isoformat(" ", "minutes")
+    assert local_time(here.isoformat()) == local_time(iso)
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ LOAD_AFTER_MS = 300
 NEEDED_LATER = (
     "labapp.session.frames",
     "labapp.run.measurers",
-    *(f"labapp.gui.pages.{key}" for key in ("surface", "dots", "trends", "capture", "setup")),
+    *(f"labapp.gui.pages.{key}.page" for key in ("surface", "dots", "trends", "capture", "setup")),
     "pyvistaqt",
 )
 """Sessions, pages and 3-D drawing, which take one or two seconds to load."""

@@ -34,9 +34,9 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication, QLabel, QMainWindow
 from stall_meter import StallMeter, run_for, run_until
 
-from labapp.gui.pages import PAGES
 from labapp.gui.preferences import Preferences
 from labapp.gui.shell.commands import make_window
+from labapp.gui.shell.steps import STEPS
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.views.view3d_kinds import OffscreenView
 from labapp.session.session import Session
@@ -306,12 +306,12 @@ def measure(window: MainWindow, session: Session) -> None:
     """Measure on every page while browsing frames; cancel once, then continue to the end."""
     space = window.workspace
     dark = session.frames[BRIGHT:].tolist()
-    for key in PAGES:
+    keys = [step.key for step in STEPS]
+    for key in keys:
         window.show_step(key)
         run_for(1.0)
     space.measure(dark[:200])  # starts the processes and fills caches
     run_until(lambda: not space.tasks.active, 120)
-    keys = list(PAGES)
     share = len(dark) // len(keys)
     worst = StallMeter()
     start_s = time.perf_counter()

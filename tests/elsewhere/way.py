@@ -68,8 +68,8 @@ def measure(folder: Path) -> Path:
 def show(session: Path, folder: Path) -> tuple[str, ...]:
     """Show every page and tool of the app; return the pages."""
     from labapp.gui.app import open_window, start_app
-    from labapp.gui.pages import PAGES
     from labapp.gui.preferences import Preferences, read_preferences
+    from labapp.gui.shell.steps import STEPS
     from labapp.gui.tools import TOOLS, show_tool
 
     app = start_app()
@@ -84,7 +84,7 @@ def show(session: Path, folder: Path) -> tuple[str, ...]:
     file = folder / "preferences.json"
     with open_window(app, Preferences(), file) as window:
         window.files.open(session)
-        for key in PAGES:
+        for key in (step.key for step in STEPS):
             window.show_step(key)
             until(key, lambda: not window.workspace.tasks.active)
             assert window.page is not None

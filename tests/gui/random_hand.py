@@ -21,10 +21,10 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.foot_switches import CALLS
-from labapp.gui.pages.capture import CapturePage
-from labapp.gui.pages.dots import DotsPage
-from labapp.gui.pages.laser import LaserPage
-from labapp.gui.pages.setup import SetupPage
+from labapp.gui.pages.capture.page import CapturePage
+from labapp.gui.pages.dots.page import DotsPage
+from labapp.gui.pages.laser.page import LaserPage
+from labapp.gui.pages.setup.page import SetupPage
 from labapp.gui.preferences import Preferences, read_preferences
 from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.window import MainWindow

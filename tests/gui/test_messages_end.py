@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QAbstractButton, QLabel
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages.export import page as export_page
-from labapp.gui.pages.setup.view import BENCH_TAB
+from labapp.gui.pages.setup.page import BENCH_TAB
 from labapp.gui.shell.window import MainWindow
 from labapp.session.session import Session
 from tests.gui.conftest import CopySample, let_draw

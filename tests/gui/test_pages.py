@@ -26,7 +26,6 @@ toy = steps.Step("toy", "The toy", "Play with the toy.", "ToyPage")
 steps.STEPS = (*steps.STEPS, toy)
 app = start_app()
 
-from labapp.gui.pages import PAGES
 from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences
 from labapp.gui.shell.commands import make_window
@@ -43,9 +42,10 @@ class ToyPage(Page):
         self.shown += 1
 
 
-module = types.ModuleType("labapp.gui.pages.toy")
+module = types.ModuleType("labapp.gui.pages.toy.page")
 module.ToyPage = ToyPage
-sys.modules["labapp.gui.pages.toy"] = module
+sys.modules["labapp.gui.pages.toy"] = types.ModuleType("labapp.gui.pages.toy")
+sys.modules["labapp.gui.pages.toy.page"] = module
 
 window = make_window(Preferences(theme="light"), Path(sys.argv[1]))
 window.show()
@@ -55,7 +55,9 @@ action.trigger()
 panel, listed = window.side_panel, window.step_list
 told = []
 hands = types.SimpleNamespace(
-    pages=set(PAGES) - {"toy"}, do=told.append, picture=lambda: told.append("a picture")
+    pages={step.key for step in steps.STEPS} - {"toy"},
+    do=told.append,
+    picture=lambda: told.append("a picture"),
 )
 way._other_pages(hands)
 found = {

@@ -151,7 +151,7 @@ def test_plots_follow_the_palette(view: PlotStack) -> None:
     for dark in (True, False):
         view.setPalette(palette(dark))
         let_draw()
-        corner = view.grab_picture().pixelColor(3, 3)
+        corner = view.canvas.grab().toImage().pixelColor(3, 3)
         assert (corner.lightness() < 128) == dark
 
 

@@ -18,9 +18,9 @@ from PySide6.QtWidgets import (
 )
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.pages import PAGES
-from labapp.gui.pages.dots import DotsPage
-from labapp.gui.pages.setup.view import BENCH_TAB, SAFETY_TAB
+from labapp.gui.pages.dots.page import DotsPage
+from labapp.gui.pages.setup.page import BENCH_TAB, SAFETY_TAB
+from labapp.gui.shell.steps import STEPS
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.fields import Field
 from labapp.gui.widgets.labels import Message
@@ -75,7 +75,7 @@ def is_problem_of_a_field(label: QLabel) -> bool:
     return isinstance(parent, Field) and label is parent.problem
 
 
-@pytest.mark.parametrize("key", PAGES)
+@pytest.mark.parametrize("key", [step.key for step in STEPS])
 def test_messages_do_not_move_the_buttons_of_a_page(opened: MainWindow, key: str, qtbot: QtBot):
     opened.show_step(key)
     page = opened.page

@@ -12,7 +12,7 @@ from PySide6.QtWidgets import QApplication, QPushButton
 from pytestqt.qtbot import QtBot
 
 from labapp.core.geometry.rig import ImagingPlane, Laser
-from labapp.gui.pages.setup import SetupPage
+from labapp.gui.pages.setup.page import SetupPage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import advising
 from labapp.gui.tools.adviser import AdviserWindow

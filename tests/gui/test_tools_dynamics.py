@@ -10,7 +10,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.pages.trends import TrendsPage
+from labapp.gui.pages.trends.page import TrendsPage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import dynamics_shown
 from labapp.gui.tools.dynamics import DynamicsWindow

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import labapp
-from labapp.gui.pages import PAGES
 from labapp.gui.shell.actions import MENUS
 from labapp.gui.shell.help import TITLES
+from labapp.gui.shell.steps import STEPS
 from labapp.gui.tools import TOOLS
 from tests.screen import screen
 from tests.waiting import PATIENCE_S
@@ -89,7 +89,7 @@ def test_no_two_pictures_are_the_same(taken: tuple[Path, str, Path]):
 
 @pytest.mark.soak
 @pytest.mark.xvfb
-@pytest.mark.parametrize("key", ["welcome", *PAGES])
+@pytest.mark.parametrize("key", ["welcome", *(step.key for step in STEPS)])
 def test_every_page_has_a_picture(taken: tuple[Path, str, Path], key: str):
     assert pictures_of(taken, key) + pictures_of(taken, f"{key}-*")
 
@@ -225,7 +225,7 @@ def test_invalid_folder_is_rejected(tmp_path: Path):
 BROKEN = """
 import sys
 from tests.tour.__main__ import main
-from labapp.gui.pages.{page} import {kind} as Kind
+from labapp.gui.pages.{page}.page import {kind} as Kind
 def fail(*_):
     raise RuntimeError("not today")
 Kind.{method} = fail

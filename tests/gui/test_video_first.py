@@ -15,9 +15,9 @@ from labapp.config.setup import update_setup
 from labapp.errors import InputError
 from labapp.gui import dialogs
 from labapp.gui.drafts import drafts, is_draft
-from labapp.gui.pages.dots import DotsPage
-from labapp.gui.pages.export import ExportPage
-from labapp.gui.pages.laser import LaserPage
+from labapp.gui.pages.dots.page import DotsPage
+from labapp.gui.pages.export.page import ExportPage
+from labapp.gui.pages.laser.page import LaserPage
 from labapp.gui.shell.window import MainWindow
 from labapp.media import open_source
 from labapp.session.copies import move_session, use_setup_of

@@ -18,14 +18,14 @@ from PySide6.QtCore import QCoreApplication, Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.pages.capture import CapturePage
-from labapp.gui.pages.dots import DotsPage
-from labapp.gui.pages.export import ExportPage
-from labapp.gui.pages.laser import LaserPage
+from labapp.gui.pages.capture.page import CapturePage
+from labapp.gui.pages.dots.page import DotsPage
+from labapp.gui.pages.export.page import ExportPage
+from labapp.gui.pages.laser.page import LaserPage
 from labapp.gui.pages.page import Page
-from labapp.gui.pages.plane import PlanePage
-from labapp.gui.pages.setup import SetupPage
-from labapp.gui.pages.surface import SurfacePage
+from labapp.gui.pages.plane.page import PlanePage
+from labapp.gui.pages.setup.page import SetupPage
+from labapp.gui.pages.surface.page import SurfacePage
 from labapp.gui.shell.window import MainWindow
 from tests.conftest import Run
 from tests.gui.conftest import SAMPLES
@@ -148,7 +148,7 @@ def correct(hand: Hand, qtbot: QtBot) -> None:
     hand.press(Qt.Key.Key_Escape)  # the click may have selected a dot, which the arrow would move
     hand.press(Qt.Key.Key_Right)
     assert hand.window.workspace.frame == CORRECTED
-    qtbot.waitUntil(lambda: dots.looking.frame == CORRECTED and dots.editor.correction is not None)
+    qtbot.waitUntil(lambda: dots.reader.frame == CORRECTED and dots.editor.correction is not None)
     port = dots.view.canvas.viewport()
     hand.click(port, hand.point(dots.view, *place_of(MOVED)))
     for key in (Qt.Key.Key_Right, Qt.Key.Key_Down, Qt.Key.Key_Down):

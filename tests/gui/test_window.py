@@ -18,7 +18,6 @@ from labapp.bundled import SAMPLE_TEXTS
 from labapp.errors import InputError
 from labapp.gui import app, dialogs
 from labapp.gui.drafts import drafts, drafts_folder
-from labapp.gui.pages import PAGES
 from labapp.gui.pages.dots.presenter import NUMBERS, detector_value
 from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences, read_preferences
@@ -27,7 +26,7 @@ from labapp.gui.shell import window as window_module
 from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.files import title
 from labapp.gui.shell.step_list import StepList, mark_icon
-from labapp.gui.shell.steps import STEPS, Mark, first_frame, first_step, states
+from labapp.gui.shell.steps import STEPS, Mark, Step, first_frame, first_step, states
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.tables import table_text
 from labapp.gui.workspace import Workspace
@@ -82,8 +81,14 @@ def plain(
     qapp: QApplication, tmp_path: Path, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[MainWindow]:
     """A window with the test pages above."""
-    kinds = (SetUp, Capture, Surface, Broken)
-    monkeypatch.setattr(window_module, "PAGES", {kind.key: kind for kind in kinds})
+    kinds = {kind.key: kind for kind in (SetUp, Capture, Surface, Broken)}
+
+    def make(step: Step, workspace: Workspace) -> Plain:
+        page = kinds.get(step.key, Plain)(workspace)
+        page.key = step.key
+        return page
+
+    monkeypatch.setattr(window_module, "make_page", make)
     main_window = make_window(Preferences(theme="light"), tmp_path / "preferences.json")
     KEPT.append(main_window)
     main_window.show()
@@ -132,6 +137,20 @@ def test_opening_shows_results_and_closing_the_welcome_page(
     assert plain.workspace.session is None
     assert plain.stack.currentWidget() is plain.welcome
     qtbot.waitUntil(lambda: "30 frames, all measured" in plain.welcome.list.item(0).text())
+
+
+@pytest.mark.parametrize(("key", "name"), [("laser", "fan"), ("export", "spacing")])
+def test_edit_in_an_inactive_window_is_finished_when_the_session_closes(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot, key: str, name: str
+):
+    window.files.open(copy_sample("gtaw"))
+    window.show_step(key)
+    field = getattr(window.page, name)
+    field.editor.selectAll()
+    qtbot.keyClicks(field.editor, "0.5")  # without the focus, as in an inactive window
+    assert field.value() != 0.5
+    window.do("close")
+    assert field.value() == 0.5
 
 
 def test_only_the_visible_page_is_refreshed(
@@ -204,10 +223,10 @@ def test_keys_move_through_frames_and_steps(
         assert plain.workspace.frame == frame
     assert "No frame before this one is corrected by hand" in plain.status_line.message.text()
     plain.do("previous_step")
-    assert plain_page(plain).key == "capture"
+    assert plain_page(plain).key == "dots"
     plain.do("step_setup")
     assert plain.step_list.currentRow() == 0
-    plain.step_list.setCurrentRow(2)
+    plain.step_list.setCurrentRow(6)
     assert plain_page(plain).key == "surface"
 
 
@@ -751,8 +770,8 @@ def test_page_that_replaces_an_empty_one_gets_the_focus(
 
 def test_window_fits_1024_px_at_150_percent(window: MainWindow, copy_sample: CopySample):
     assert window.files.open(copy_sample("thumb_tack"))
-    for key in PAGES:
-        window.show_step(key)
+    for step in STEPS:
+        window.show_step(step.key)
         minimum = window.minimumSizeHint()
         assert minimum.width() <= 1024 / 1.5
         assert minimum.height() <= 700 / 1.5

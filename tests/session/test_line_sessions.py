@@ -15,7 +15,7 @@ from labapp.core.geometry.line_pattern import LineRays
 from labapp.core.lines.states import State
 from labapp.core.rows.correction import Correction
 from labapp.errors import InputError
-from labapp.gui.pages.dots.lines import show_lines
+from labapp.gui.pages.dots.line_presenter import show_lines
 from labapp.gui.pages.setup import presenter as setup_page
 from labapp.gui.pages.surface import presenter as surface_page
 from labapp.gui.pages.trends import presenter as trends_page

@@ -10,13 +10,13 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMessageBox, QTabBar, QToolButton
 
 from labapp.gui.live.canvas import PARTS
-from labapp.gui.pages.bench_check import BenchCheckPage
-from labapp.gui.pages.capture import CapturePage
-from labapp.gui.pages.dots import DotsPage
-from labapp.gui.pages.laser import LaserPage
-from labapp.gui.pages.plane import PlanePage
-from labapp.gui.pages.setup import SetupPage
-from labapp.gui.pages.surface import SurfacePage
+from labapp.gui.pages.bench_check.page import BenchCheckPage
+from labapp.gui.pages.capture.page import CapturePage
+from labapp.gui.pages.dots.page import DotsPage
+from labapp.gui.pages.laser.page import LaserPage
+from labapp.gui.pages.plane.page import PlanePage
+from labapp.gui.pages.setup.page import SetupPage
+from labapp.gui.pages.surface.page import SurfacePage
 from labapp.gui.shell.steps import STEPS
 from labapp.gui.tools.adviser import AdviserWindow
 from labapp.gui.tools.analysis import AnalysisWindow
@@ -250,9 +250,9 @@ def _surface(hands: Hands) -> None:
     hands.enter("Heights ×", "1")
     show = hands.find(QToolButton, "Show", QToolButton.text)
     hands.popup(show.menu(), "show", show.showMenu)
-    page.parts["rays"].trigger()
+    page.drawn_items["rays"].trigger()
     hands.picture("rays")
-    page.parts["rays"].trigger()
+    page.drawn_items["rays"].trigger()
     hands.answer_dialog("save-picture", lambda: hands.press("Save…"))
     hands.answer_dialog("save-copy", lambda: hands.do("copy"))
 

@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QVBoxLayout, QWidget
 from labapp.gui.shell.steps import Lead, State, read_only
 from labapp.gui.tasks import DONE, Task, Work
 from labapp.gui.widgets.fields import Field
-from labapp.gui.widgets.labels import Message
+from labapp.gui.widgets.labels import Message, allow
 from labapp.gui.widgets.layouts import vbox
 from labapp.gui.workspace import Workspace
 
@@ -86,6 +86,12 @@ class Page(QWidget):
         self._answers.add(message)
         return message
 
+    def change_when_edited(self, field: Field, change: Callable[[Session, Any], object]) -> None:
+        """Change the session by a function of it and the new value when a field is edited."""
+        field.edited.connect(
+            lambda value: self.workspace.attempt(lambda session: change(session, value))
+        )
+
     def lock_with_session(self, *widgets: QWidget) -> None:
         """Disable these widgets, which change the session, while it is open read-only."""
         self._changing += widgets
@@ -100,8 +106,7 @@ class Page(QWidget):
             if isinstance(widget, Field):
                 widget.lock(why)
             else:
-                widget.setEnabled(not why)
-                widget.setToolTip(why or widget.property("usual tip"))
+                allow(widget, widget.property("usual tip"), why)
 
     def _take_session(self) -> None:
         """Clear messages about the previous session."""

@@ -125,7 +125,7 @@ def measure(window: MainWindow, frames: list[int] | None) -> None:
 
 def enter_setup(window: MainWindow) -> None:
     """Show the drawing of the bench."""
-    from labapp.gui.pages.setup.view import BENCH_TAB, SetupPage
+    from labapp.gui.pages.setup.page import BENCH_TAB, SetupPage
 
     window.show_step("setup")
     if isinstance(window.page, SetupPage):

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication, QStackedWidget, QWidget
 
+from labapp.gui.widgets.fields import flush_fields
+
 
 def go_to_part(parts: Sequence[QWidget], by: int) -> None:
     """Move the focus to the next part of a window that can have it, or the previous one (-1)."""
@@ -39,10 +41,12 @@ def takes_keys(widget: QWidget, part: QWidget) -> bool:
 
 
 def finish_edit(*parts: QWidget) -> None:
-    """Remove the focus from some parts: a field is finished when it loses the focus."""
+    """Remove the focus from some parts, and finish edits in progress in their fields."""
     focus = QApplication.focusWidget()
     if focus is not None and any(_holds(part, focus) for part in parts):
         focus.clearFocus()
+    for part in parts:
+        flush_fields(part)  # in an inactive window no field has the focus
 
 
 def show_in(stack: QStackedWidget, seen: QWidget) -> None:

@@ -294,7 +294,7 @@ class Step:
     """One step of the guided procedure."""
 
     key: str
-    """Name in code; the page is in ``labapp.gui.pages.KEY``."""
+    """Name in code; the page is in ``labapp.gui.pages.KEY.page``."""
     title: str
     """Name for the operator."""
     hint: str

@@ -23,7 +23,7 @@ from PySide6.QtWidgets import (
 from labapp.core.values import IntArray
 from labapp.gui.dialogs import dropped_paths
 from labapp.gui.drafts import drafts, is_draft
-from labapp.gui.pages import PAGES
+from labapp.gui.pages import make_page
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.welcome import Welcome
 from labapp.gui.preferences import THEMES, PreferencesStore
@@ -85,15 +85,12 @@ class MainWindow(QMainWindow):
         """State of each frame (`FrameStatus`), shape (n,)."""
         self.page: Page | None = None
         """The page in view; None for the welcome page."""
-        self._steps = tuple(step for step in STEPS if step.key in PAGES)
         self._states = states(None)
         self._changes_due = False
         self._rest = QTimer(self, singleShot=True)
         self._rest.timeout.connect(self._rested)
         self._make_views()
-        without = {f"step_{step.key}" for step in STEPS if step not in self._steps}
-        actions = [action for action in ACTIONS if action.name not in without]
-        self.menus = Menus(self, actions, self.do, self.files.open)
+        self.menus = Menus(self, ACTIONS, self.do, self.files.open)
         self.timeline.addActions([self.menus.actions[name] for name in OF_A_FRAME])
         self._commands = commands(self)
         self._connect()
@@ -112,7 +109,7 @@ class MainWindow(QMainWindow):
         for each in (self.welcome, self.empty):
             self.stack.addWidget(each)
         self.setCentralWidget(self.stack)
-        self.step_list = StepList(self._steps)
+        self.step_list = StepList(STEPS)
         self.side_panel = SidePanel()
         self.timeline = Timeline(TICKS)
         self.log_panel = LogPanel()
@@ -213,10 +210,11 @@ class MainWindow(QMainWindow):
 
     def show_step(self, key: str) -> None:
         """Show the page of a step; it is created on first use."""
-        if self.workspace.session is None or key not in PAGES:
+        if self.workspace.session is None:
             return
+        step = next(step for step in STEPS if step.key == key)
         if key not in self.pages:
-            made = self.workspace.run_or_report(lambda: PAGES[key](self.workspace))
+            made = self.workspace.run_or_report(lambda: make_page(step, self.workspace))
             if made is None:
                 return
             self.pages[key] = made
@@ -227,9 +225,9 @@ class MainWindow(QMainWindow):
             self._leave()
             self.page = page
             listed = self.step_list.hasFocus()
-            step = next(step for step in STEPS if step.key == key).of(self.workspace.session)
-            page.setAccessibleName(step.title)
-            self.side_panel.show_panel(page.panel, step)
+            shown = step.of(self.workspace.session)
+            page.setAccessibleName(shown.title)
+            self.side_panel.show_panel(page.panel, shown)
             self.show_answer("")
             self._show_lead()
             if not listed:
@@ -247,7 +245,7 @@ class MainWindow(QMainWindow):
     def go_step(self, by: int) -> None:
         """Go forward or back by some steps."""
         if self.page is not None:
-            keys = [step.key for step in self._steps]
+            keys = [step.key for step in STEPS]
             place = keys.index(self.page.key) + by
             self.show_step(keys[max(0, min(len(keys) - 1, place))])
 
@@ -311,13 +309,12 @@ class MainWindow(QMainWindow):
             self.stack.setCurrentWidget(self.welcome)
             self.step_list.show_step("")
             self._list_recent()
-        elif self._steps:
-            keys = [step.key for step in self._steps]
+        else:
             first = self.workspace.run_or_report(lambda: first_step(session)) or "setup"
             frame = self.workspace.run_or_report(lambda: first_frame(session))
             if frame is not None:
                 self.workspace.show_frame(frame)
-            self.show_step(first if first in keys else keys[0])
+            self.show_step(first)
         self._show_docks()
 
     def _changed(self) -> None:
@@ -354,7 +351,7 @@ class MainWindow(QMainWindow):
         self.timeline.set_frame(self.workspace.frame)
         self._states = self.workspace.run_or_report(lambda: states(session, seen)) or states(None)
         own = {key: page.state(self._states[key]) for key, page in self.pages.items()}
-        steps = [step.of(session) for step in self._steps]
+        steps = [step.of(session) for step in STEPS]
         self.step_list.show_titles(steps)
         self.menus.show_titles(steps)
         self.step_list.show_states(self._states | own)

@@ -10,7 +10,7 @@ from labapp.gui.tasks import Control
 from labapp.gui.tools import advising
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.views.ranges import RangeField
-from labapp.gui.widgets.fields import ChoiceField, NumberField
+from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
 from labapp.gui.widgets.labels import wrapping_label
 from labapp.gui.widgets.layouts import Group, fill, scrolled
 from labapp.gui.widgets.result_table import ResultTable
@@ -138,15 +138,14 @@ class AdviserWindow(ToolWindow):
 
     def values(self) -> advising.Values:
         """The request in the fields."""
+        flush_fields(self.form)
         values = {table: dict(keys) for table, keys in self._asked.items()}
         values["pools"]["kind"] = self.kind.value()
         for key, field in self.ranges.items():
             table, _, name = key.partition(".")
-            field.flush()
             values[table][name] = list(field.value())
         for key, number in self.numbers.items():
             table, _, name = key.partition(".")
-            number.flush()
             values[table][name] = number.value()
         return values
 

@@ -11,7 +11,7 @@ from labapp.gui.tasks import Control
 from labapp.gui.tools import analysing
 from labapp.gui.tools.analysing import BUDGET, OPENED, PARTS, USUAL
 from labapp.gui.tools.tool import ToolWindow, progress_of
-from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, flush_fields
 from labapp.gui.widgets.labels import wrapping_label
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
@@ -153,8 +153,7 @@ class AnalysisWindow(ToolWindow):
 
     def start(self) -> None:
         """Compute the ticked parts in the background, one after the other."""
-        for field in (*self.sizes.values(), self.step, self.frames, self.draws):
-            field.flush()
+        flush_fields(self.form)
         ticked = tuple(key for key, box in self.parts.items() if box.isChecked())
         scheme = self.scheme.value()
         options = AnalysisOptions(

@@ -14,7 +14,7 @@ from labapp.gui.tasks import Control
 from labapp.gui.tools import dynamics_shown as shown
 from labapp.gui.tools.tool import ToolWindow
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.fields import ChoiceField, NumberField
+from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
 from labapp.gui.widgets.labels import wrapping_label
 from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.gui.widgets.sheet import Sheet
@@ -131,8 +131,7 @@ class DynamicsWindow(ToolWindow):
 
     def start(self) -> None:
         """Analyse the session's results in the background."""
-        for field in (self.segment, *self.band):
-            field.flush()
+        flush_fields(self.form)
         session, seen = self.workspace.session, self.workspace.overview()
         why = shown.impossible(session, seen)
         if why or session is None or seen is None or self.working:

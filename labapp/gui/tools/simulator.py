@@ -18,7 +18,7 @@ from labapp.gui.tools import simulating
 from labapp.gui.tools.simulating import ScenarioPreview
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.views.picture import PictureView
-from labapp.gui.widgets.fields import ChoiceField, NumberField
+from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
 from labapp.gui.widgets.labels import wrapping_label
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.result_table import ResultTable
@@ -202,8 +202,7 @@ class SimulatorWindow(ToolWindow):
 
     def start(self) -> None:
         """Write recording and true values in the background; the folder is complete or absent."""
-        for field in (self.frames, self.seed, self.folder):
-            field.flush()
+        flush_fields(self.form)
         path, seed = Path(self.scenario.value()), int(self.seed.value() or 0)
         frames = int(self.frames.value() or 1)
         if not self.folder.value().strip():

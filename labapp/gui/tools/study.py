@@ -16,7 +16,13 @@ from labapp.gui.dialogs import SETUP_FILES, ask_file, ask_folder, ask_save, drop
 from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import studying
 from labapp.gui.tools.tool import ToolWindow, progress_of
-from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
+from labapp.gui.widgets.fields import (
+    ChoiceField,
+    FieldForm,
+    NumberField,
+    TextField,
+    flush_fields,
+)
 from labapp.gui.widgets.labels import show_words, wrapping_label
 from labapp.gui.widgets.layouts import vbox
 from labapp.gui.widgets.path_field import PathField
@@ -210,8 +216,7 @@ class StudyWindow(ToolWindow):
 
     def choose_new(self) -> None:
         """Ask for the file of a new study, and create it."""
-        for field in (self.recordings, self.setup):
-            field.flush()
+        flush_fields(self.form)
         if not self.recordings.value().strip() or not self.setup.value().strip():
             self.say("Enter the recordings and their set-up first, or choose them", True)
             return
@@ -323,8 +328,7 @@ class StudyWindow(ToolWindow):
 
     def start(self) -> None:
         """Run the study in the background."""
-        for field in (self.workers, self.scheduler):
-            field.flush()
+        flush_fields(self.form)
         if self.study is None:
             return
         path = self.study.path

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, Qt
 from PySide6.QtGui import (
     QAccessible,
     QAccessibleInterface,
-    QAction,
-    QKeySequence,
+    QGuiApplication,
+    QKeyEvent,
     QPainter,
     QPaintEvent,
     QPalette,
@@ -17,6 +17,12 @@ from PySide6.QtGui import (
 from PySide6.QtWidgets import QAccessibleWidget, QWidget
 
 from labapp.gui.theme import FollowsTheme
+
+if TYPE_CHECKING:
+    import pyqtgraph as pg
+
+ZOOM = 1.25
+"""Factor of a zoom by a key."""
 
 
 class Drawn(FollowsTheme, QWidget):
@@ -58,20 +64,31 @@ class Drawn(FollowsTheme, QWidget):
 
 
 class Plotted(Drawn):
-    """A drawing with axes."""
+    """A drawing with axes in its ``canvas``: + and − zoom, F shows all."""
 
     ROLE = QAccessible.Role.Chart
+    canvas: pg.GraphicsView
 
-    def add_menu(self, *works: tuple[str, Callable[[], object]]) -> None:
-        """Add a context menu of texts and functions; Ctrl+C calls the first."""
-        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
-        for words, work in works:
-            action = QAction(words, self)
-            action.triggered.connect(lambda *_, do=work: do())
-            self.addAction(action)
-        copy = self.actions()[0]
-        copy.setShortcut(QKeySequence.StandardKey.Copy)
-        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
+    def copy_picture(self) -> None:
+        """Copy the visible picture to the clipboard."""
+        QGuiApplication.clipboard().setPixmap(self.canvas.grab())
+
+    def fit(self) -> None:
+        """Show all."""
+
+    def zoom(self, factor: float) -> None:
+        """Zoom about the centre; a factor above 1 enlarges."""
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:
+        """Zoom, or show all."""
+        if event.key() in (Qt.Key.Key_Plus, Qt.Key.Key_Equal):
+            self.zoom(ZOOM)
+        elif event.key() == Qt.Key.Key_Minus:
+            self.zoom(1 / ZOOM)
+        elif event.key() == Qt.Key.Key_F:
+            self.fit()
+        else:
+            super().keyPressEvent(event)
 
 
 def _accessible(_class_name: str, thing: QObject) -> QAccessibleInterface | None:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from PySide6.QtCore import QEvent, QPointF, Qt
-from PySide6.QtGui import QGuiApplication, QKeyEvent, QPalette
+from PySide6.QtGui import QPalette
 from PySide6.QtWidgets import QVBoxLayout
 
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.views.picture_files import save_plot
+from labapp.gui.widgets.buttons import add_menu
 from labapp.gui.widgets.labels import plain_label, wrapping_label
 
 KEYS = "+ − zoom, F shows all"
-ZOOM = 1.25
 
 
 class Chart(Plotted):
@@ -31,7 +31,7 @@ class Chart(Plotted):
         self._unit = unit
         self.setToolTip(f"{name}: wheel to zoom, drag to move; {KEYS}")
         self.title = wrapping_label(name)
-        self.plot = make_plot(x_label, y_label, equal)
+        self.plot = self.canvas = make_plot(x_label, y_label, equal)
         self.plot.setMinimumSize(88, 80)
         layout = QVBoxLayout(self)
         layout.setContentsMargins(1, 1, 1, 1)
@@ -42,15 +42,20 @@ class Chart(Plotted):
         self._at.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
         self._at.hide()
         self.plot.scene().sigMouseMoved.connect(self._moved_to)
-        self.add_menu(
+        add_menu(
+            self,
             ("Copy picture", self.copy_picture),
             ("Save picture…", save_plot(self, self.plot, "chart")),
-            ("Show all", self.plot.autoRange),
+            ("Show all", self.fit),
         )
 
-    def copy_picture(self) -> None:
-        """Copy the visible plot to the clipboard."""
-        QGuiApplication.clipboard().setPixmap(self.plot.grab())
+    def fit(self) -> None:
+        """Show all."""
+        self.plot.autoRange()
+
+    def zoom(self, factor: float) -> None:
+        """Zoom about the centre; a factor above 1 enlarges."""
+        self.plot.getViewBox().scaleBy((1 / factor, 1 / factor))
 
     def _moved_to(self, at: QPointF) -> None:
         """Show the values under the pointer."""
@@ -79,15 +84,3 @@ class Chart(Plotted):
         self.accent = palette.color(QPalette.ColorRole.Highlight)
         self.plot.setBackground(palette.color(QPalette.ColorRole.Base))
         paint_axes(self.plot, self.text, self.text)
-
-    def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Zoom, or show all."""
-        box = self.plot.getViewBox()
-        if event.key() in (Qt.Key.Key_Plus, Qt.Key.Key_Equal):
-            box.scaleBy((1 / ZOOM, 1 / ZOOM))
-        elif event.key() == Qt.Key.Key_Minus:
-            box.scaleBy((ZOOM, ZOOM))
-        elif event.key() == Qt.Key.Key_F:
-            self.plot.autoRange()
-        else:
-            super().keyPressEvent(event)

@@ -15,7 +15,6 @@ from PySide6.QtGui import (
     QColor,
     QFontMetricsF,
     QGuiApplication,
-    QImage,
     QKeyEvent,
     QPalette,
 )
@@ -27,6 +26,7 @@ from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.axes import paint_axes, plain_axes
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.views.picture_files import save_plot
+from labapp.gui.widgets.buttons import add_menu
 from labapp.gui.widgets.labels import plain_tip, wrapping_label
 from labapp.gui.widgets.layouts import fill, scrolled
 
@@ -83,7 +83,8 @@ class PlotStack(Plotted):
         scene = self.canvas.scene()
         scene.sigMouseClicked.connect(self._clicked)
         scene.sigMouseMoved.connect(self._moved)
-        self.add_menu(
+        add_menu(
+            self,
             ("Copy picture", self.copy_picture),
             ("Save picture…", save_plot(self, self.canvas, "trends")),
             ("Copy values as table", self.copy_table),
@@ -138,15 +139,6 @@ class PlotStack(Plotted):
             self._plots[0].getViewBox().scaleBy(x=1 / factor)
 
     # --- copies -------------------------------------------------------------------------------
-
-    def grab_picture(self) -> QImage:
-        """The visible plots as an image."""
-        picture: QImage = self.canvas.grab().toImage()
-        return picture
-
-    def copy_picture(self) -> None:
-        """Copy the visible plots to the clipboard."""
-        QGuiApplication.clipboard().setImage(self.grab_picture())
 
     def copy_table(self) -> None:
         """Copy the points of all curves to the clipboard, tab-separated."""
@@ -233,10 +225,9 @@ class PlotStack(Plotted):
             self.chosen.emit(int(curve.key[int(np.nanargmin(distance))]))
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Step through the points, or zoom."""
+        """Step through the points; zoom."""
         steps = {Qt.Key.Key_Left: -1, Qt.Key.Key_Right: 1, Qt.Key.Key_Home: -(10**9)}
         steps[Qt.Key.Key_End] = 10**9
-        zooms = {Qt.Key.Key_Plus: 1.25, Qt.Key.Key_Equal: 1.25, Qt.Key.Key_Minus: 0.8}
         key = Qt.Key(event.key())
         if key in steps:
             there = next_key(
@@ -244,10 +235,6 @@ class PlotStack(Plotted):
             )
             if there is not None:
                 self.chosen.emit(there)
-        elif key in zooms:
-            self.zoom(zooms[key])
-        elif key == Qt.Key.Key_F:
-            self.fit()
         else:
             super().keyPressEvent(event)
 

@@ -50,11 +50,6 @@ class RangeField(Field):
         self.most.set_value(ends[1])
         self._judge()
 
-    def flush(self) -> None:
-        """Finish an edit in progress, as when the field loses the focus."""
-        self.least.flush()
-        self.most.flush()
-
     def _emit_change(self) -> None:
         self._judge()
         self.edited.emit(self.value())

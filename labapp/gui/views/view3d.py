@@ -11,12 +11,10 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEvent, QObject, QPoint, QPointF, Qt, Signal
 from PySide6.QtGui import (
-    QAction,
     QContextMenuEvent,
     QGuiApplication,
     QImage,
     QKeyEvent,
-    QKeySequence,
     QMouseEvent,
     QPainter,
     QPalette,
@@ -29,6 +27,7 @@ from labapp.export.rendering.drawing import Camera, Direction, Drawing, build_sc
 from labapp.export.rendering.pick import point_over, seen_point
 from labapp.export.rendering.scene import Scene
 from labapp.gui.views.canvas import Drawn
+from labapp.gui.widgets.buttons import add_action
 
 LOOKS: dict[Direction, tuple[str, str]] = {
     "top": ("Top", "Look from the top (1 in the view)"),
@@ -105,19 +104,13 @@ class View3d(Drawn):
         self.follow_theme()
 
     def _add_actions(self) -> None:
-        works: tuple[tuple[str, str, str, Callable[[], object]], ...] = (
+        for words, key, tip, work in (
             ("Copy picture", "Ctrl+C", "Copy the 3-D picture to the clipboard", self.copy_picture),
             ("Copy point", "P", "Copy X, Y, Z ± of the point that was read off", self.copy_point),
             ("Clear point", "Esc", "Remove the mark of the point", self.forget_point),
             ("Show all", "F", "Bring all into view from the side chosen last", self.fit),
-        )
-        for words, key, tip, work in works:
-            action = QAction(words, self)
-            action.setToolTip(f"{tip} ({key})")
-            action.setShortcut(QKeySequence(key))
-            action.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
-            action.triggered.connect(lambda *_, do=work: do())
-            self.addAction(action)
+        ):
+            add_action(self, words, work, key, tip)
 
     # --- what is shown -----------------------------------------------------------------------
 

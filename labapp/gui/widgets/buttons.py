@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QCheckBox, QPushButton, QToolButton
+from PySide6.QtGui import QAction, QKeySequence
+from PySide6.QtWidgets import QCheckBox, QPushButton, QToolButton, QWidget
 
 
 def button(text: str, tip: str, work: Callable[[], object]) -> QPushButton:
@@ -35,3 +36,23 @@ def check_box(text: str, tip: str, toggled: Callable[[bool], object]) -> QCheckB
     box.setToolTip(tip)
     box.toggled.connect(toggled)
     return box
+
+
+def add_action(
+    widget: QWidget, words: str, work: Callable[[], object], key: str = "", tip: str = ""
+) -> None:
+    """Add an action to a widget; its key works while the widget has the focus."""
+    action = QAction(words, widget)
+    if tip:
+        action.setToolTip(f"{tip} ({key})")
+    action.setShortcut(QKeySequence(key))
+    action.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
+    action.triggered.connect(lambda *_: work())
+    widget.addAction(action)
+
+
+def add_menu(widget: QWidget, *works: tuple[str, Callable[[], object]]) -> None:
+    """Add functions to the context menu of a widget by their texts; Ctrl+C calls its first one."""
+    widget.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
+    for words, work in works:
+        add_action(widget, words, work, "" if widget.actions() else "Ctrl+C")

@@ -62,6 +62,9 @@ class Field(QWidget):
         vbox(line, self.problem, of=self).setSpacing(2)
         self.set_problem("")
 
+    def flush(self) -> None:
+        """Finish an edit in progress; for fields in which one can be."""
+
     def set_problem(self, words: str) -> None:
         """Show a problem of the field's value; empty: none."""
         self._fault = words
@@ -141,7 +144,7 @@ class NumberField(Field):
         self._typed = False
         self._box.line.textEdited.connect(self._note_typing)
         self._box.stepped.connect(self._step)
-        self._box.editingFinished.connect(self._commit)
+        self._box.editingFinished.connect(self.flush)
         self._pause = QTimer(self, singleShot=True, interval=STEP_PAUSE_MS)
         self._pause.timeout.connect(self._emit_change)
 
@@ -165,10 +168,6 @@ class NumberField(Field):
         """Show in grey which value applies while the field is empty."""
         self._box.line.setPlaceholderText(words)
 
-    def flush(self) -> None:
-        """Finish a current edit, as leaving the field does."""
-        self._commit()
-
     def _shown(self, value: float | None) -> str:
         return "" if value is None else entered(value, self.decimals)
 
@@ -179,7 +178,8 @@ class NumberField(Field):
     def _note_typing(self) -> None:
         self._typed = True
 
-    def _commit(self) -> None:
+    def flush(self) -> None:
+        """Finish a current edit, as leaving the field does."""
         text = self._box.text()
         if text != self._shown(self._value):
             value, problem = self._read(text)
@@ -446,6 +446,12 @@ class FieldForm(QWidget):
     def add_wide(self, widget: QWidget) -> None:
         """Put something else below the fields, over the whole width."""
         self._grid.addWidget(widget, self._grid.rowCount(), 0, 1, 3)
+
+
+def flush_fields(part: QWidget) -> None:
+    """Finish edits in progress in all fields within a part, as leaving them does."""
+    for field in part.findChildren(Field):
+        field.flush()
 
 
 def whole(label: str, lowest: int, tip: str) -> NumberField:

@@ -29,6 +29,12 @@ def plain_tip(text: str) -> str:
     return QtGui.Qt.convertFromPlainText(text) if rich else text
 
 
+def allow(widget: QWidget, tip: str, why_not: str) -> None:
+    """Enable a widget, with its tooltip; or disable it, with the reason unless that is empty."""
+    widget.setEnabled(not why_not)
+    widget.setToolTip(plain_tip(why_not or tip))
+
+
 def heading(text: str) -> QLabel:
     """A heading above a group of widgets, in bold."""
     label = wrapping_label(text)

@@ -9,6 +9,7 @@ from PySide6.QtGui import QCursor, QGuiApplication
 from PySide6.QtWidgets import QWhatsThis
 
 from labapp.gui.digits import ResultRow, as_csv, as_text
+from labapp.gui.widgets.buttons import add_menu
 from labapp.gui.widgets.tables import FullTable
 from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF
 
@@ -27,8 +28,8 @@ class ResultTable(FullTable):
         tip = f"{name}: Ctrl+C copies it; right click for CSV, and for what ± is"
         super().__init__(name, tip, ["", "Value", "±", "Unit"])
         self.rows: tuple[ResultRow, ...] = ()
-        self.offer(
-            ("Copy table", self.copy_text),
+        add_menu(
+            self,
             ("Copy table as CSV", self.copy_csv),
             ("What is ±?", lambda: QWhatsThis.showText(QCursor.pos(), PLUS_MINUS, self)),
         )

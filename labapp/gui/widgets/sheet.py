@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QAction, QGuiApplication, QImage, QKeySequence, QPixmap, QResizeEvent
+from PySide6.QtGui import QGuiApplication, QImage, QPixmap, QResizeEvent
 from PySide6.QtWidgets import QFrame, QScrollArea
 
 from labapp.gui.theme import FollowsTheme, is_dark
+from labapp.gui.widgets.buttons import add_menu
 from labapp.gui.widgets.labels import plain_label
 
 MOST_SCALE = 1.25
@@ -31,12 +32,7 @@ class Sheet(FollowsTheme, QScrollArea):
         self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self.setAccessibleName(name)
         self.describe("")
-        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
-        copy = QAction("Copy picture", self)
-        copy.setShortcut(QKeySequence.StandardKey.Copy)
-        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
-        copy.triggered.connect(self.copy_picture)
-        self.addAction(copy)
+        add_menu(self, ("Copy picture", self.copy_picture))
         self.follow_theme()
 
     def describe(self, words: str) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QItemSelectionModel, QSignalBlocker, Qt, QTimer
-from PySide6.QtGui import QAction, QGuiApplication, QKeySequence
+from PySide6.QtGui import QGuiApplication
 from PySide6.QtWidgets import (
     QAbstractItemView,
     QHeaderView,
@@ -16,6 +16,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.digits import cell_text
+from labapp.gui.widgets.buttons import add_menu
 from labapp.gui.widgets.labels import plain_tip
 from labapp.text import column_heading
 
@@ -45,7 +46,14 @@ class ReadTable(QTableWidget):
         header = self.horizontalHeader()
         header.setHighlightSections(False)
         header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
+        add_menu(self, ("Copy table", self.copy_text))
+
+    def show_texts(self, rows: Sequence[Sequence[str]], words: Sequence[int] = (0,)) -> None:
+        """Show rows of texts: numbers, except in the columns ``words``."""
+        self.setRowCount(len(rows))
+        for row, texts in enumerate(rows):
+            for column, text in enumerate(texts):
+                self.set_cell(row, column, text, number=column not in words)
 
     def set_cell(self, row: int, column: int, text: str, *, number: bool, tip: str = "") -> None:
         """Show a text in a cell, changed in place so that nothing moves; numbers are right-aligned.
@@ -83,16 +91,6 @@ class ReadTable(QTableWidget):
         """Copy the shown texts to the clipboard, separated by tabs."""
         QGuiApplication.clipboard().setText(table_text(self))
 
-    def offer(self, *copies: tuple[str, Callable[[], None]]) -> None:
-        """Add copy actions to the context menu by their labels; Ctrl+C runs the first."""
-        for words, work in copies:
-            action = QAction(words, self)
-            action.triggered.connect(work)
-            self.addAction(action)
-        first = self.actions()[0]
-        first.setShortcut(QKeySequence.StandardKey.Copy)
-        first.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
-
 
 class FullTable(ReadTable):
     """A table as high as all its rows; long names in its first column take more lines."""
@@ -112,12 +110,9 @@ class FullTable(ReadTable):
         self.resizeRowsToContents()
         self.setFixedHeight(self.full_height)
 
-    def show_texts(self, rows: Sequence[Sequence[str]]) -> None:
-        """Show rows of texts: a name followed by numbers."""
-        self.setRowCount(len(rows))
-        for row, texts in enumerate(rows):
-            for column, text in enumerate(texts):
-                self.set_cell(row, column, text, number=column > 0)
+    def show_texts(self, rows: Sequence[Sequence[str]], words: Sequence[int] = (0,)) -> None:
+        """Show rows of texts: numbers, except in the columns ``words``."""
+        super().show_texts(rows, words)
         self.fit_height()
 
 
@@ -129,8 +124,8 @@ class CellTable(ReadTable):
         self.table: Table | None = None
         self.setAccessibleDescription("Arrow keys move; Ctrl+C copies it")
         self.setAlternatingRowColors(True)
-        self.offer(
-            ("Copy table", self.copy_text),
+        add_menu(
+            self,
             ("Copy table as CSV", self.copy_csv),
             ("Copy table as Markdown", self.copy_markdown),
         )

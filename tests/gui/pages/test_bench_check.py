@@ -28,8 +28,9 @@ from labapp.core.geometry.uncertainty import INDEX
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.values import CannotMeasure
 from labapp.gui.digits import with_sigma
-from labapp.gui.pages.bench_check import BenchCheckPage, presenter
-from labapp.gui.pages.bench_check.presenter import Checked, Chosen
+from labapp.gui.pages.bench_check import presenter
+from labapp.gui.pages.bench_check.page import BenchCheckPage
+from labapp.gui.pages.bench_check.presenter import CheckResult, ListedPicture
 from labapp.gui.pages.setup import presenter as setup_presenter
 from labapp.gui.shell.steps import Mark, states
 from labapp.gui.workspace import Workspace
@@ -61,8 +62,8 @@ def plate() -> GreyImage:
 
 
 @pytest.fixture(scope="module")
-def checked(plate: GreyImage) -> Checked:
-    chosen = [Chosen("plate.png", plate)]
+def checked(plate: GreyImage) -> CheckResult:
+    chosen = [ListedPicture("plate.png", plate)]
     text = SETUP.read_text("utf-8")
     return presenter.check(chosen, (text, SETUP), DotSettings(), lambda *_: None)
 
@@ -71,7 +72,7 @@ def checked(plate: GreyImage) -> Checked:
 
 
 def test_picture_has_the_entered_mirror() -> None:
-    one = Chosen("a", np.zeros((2, 2), np.uint8))
+    one = ListedPicture("a", np.zeros((2, 2), np.uint8))
     assert one.mirror == Plate(0.0)
     cap = replace(one.of_kind("cap"), height_mm=0.5, diameter_mm=8.0)
     assert cap.mirror == Cap(8.0, 0.5)
@@ -82,7 +83,7 @@ def test_picture_has_the_entered_mirror() -> None:
 
 
 def test_uncertainty_of_a_mirror_is_entered() -> None:
-    one = Chosen("a", np.zeros((2, 2), np.uint8))
+    one = ListedPicture("a", np.zeros((2, 2), np.uint8))
     assert one.usual_height_sigma_mm == Plate.height_sigma_mm
     known = replace(one, height_sigma_mm=0.005, level_sigma_deg=0.03)
     assert known.mirror == Plate(0.0, 0.005, 0.03)
@@ -92,19 +93,20 @@ def test_uncertainty_of_a_mirror_is_entered() -> None:
 
 
 @pytest.mark.slow
-def test_uncertainty_of_a_mirror_is_stored(checked: Checked) -> None:
+def test_uncertainty_of_a_mirror_is_stored(checked: CheckResult) -> None:
     (picture,), (chosen,) = checked.record.pictures, checked.chosen
-    assert Chosen.of_kept(picture, chosen.image).mirror == chosen.mirror
+    assert ListedPicture.of_kept(picture, chosen.image).mirror == chosen.mirror
     assert chosen.is_of(picture)
     assert chosen.is_of(replace(picture, pose_sigma=()))  # of an earlier version
     level = replace(chosen, level_sigma_deg=0.03)
     assert not level.is_of(picture)
     sigma = tuple(zip(level.mirror.parameters, level.mirror.sigma.tolist(), strict=True))
-    assert Chosen.of_kept(replace(picture, pose_sigma=sigma), chosen.image).mirror == level.mirror
+    picture = replace(picture, pose_sigma=sigma)
+    assert ListedPicture.of_kept(picture, chosen.image).mirror == level.mirror
 
 
 @pytest.mark.slow
-def test_undetectable_height_error_is_reported(checked: Checked) -> None:
+def test_undetectable_height_error_is_reported(checked: CheckResult) -> None:
     (spot,) = checked.blind
     assert spot.picture == "plate.png"
     assert f"{spot.noticed_mm:.2g} mm" in checked.words
@@ -112,7 +114,7 @@ def test_undetectable_height_error_is_reported(checked: Checked) -> None:
 
 
 @pytest.mark.slow
-def test_check_finds_deviations_and_undetermined_quantities(checked: Checked) -> None:
+def test_check_finds_deviations_and_undetermined_quantities(checked: CheckResult) -> None:
     assert checked.usable
     record = checked.record
     k = INDEX["pattern.rotation_deg"]
@@ -122,16 +124,16 @@ def test_check_finds_deviations_and_undetermined_quantities(checked: Checked) ->
     assert len(rows) == uncertain.sum() == len(INDEX) - 2  # there is no glass
     assert ("Imaging plane", "s") in rows
     rotation = rows["Pattern", "Rotation"]
-    assert rotation.determined
+    assert rotation.texts[-1] == presenter.DETERMINED
     assert rotation.texts[-1] == presenter.DETERMINED
     assert " ± " in rotation.texts[2]
-    undetermined = {name for name, row in rows.items() if not row.determined}
+    undetermined = {name for name, row in rows.items() if row.texts[-1] == presenter.NOT_DETERMINED}
     share = record.after_sigma[uncertain] / record.before_sigma[uncertain]
     assert len(undetermined) == (share > 0.8).sum() > 0
 
 
 @pytest.mark.slow
-def test_known_mirror_is_measured_with_the_adjusted_bench(checked: Checked) -> None:
+def test_known_mirror_is_measured_with_the_adjusted_bench(checked: CheckResult) -> None:
     ((name, known, measured, sigma),) = checked.record.pictures[0].measured
     assert (name, known) == ("height", 0.0)
     assert 0 < sigma < 0.05
@@ -152,7 +154,7 @@ def test_known_mirror_is_measured_with_the_adjusted_bench(checked: Checked) -> N
 
 
 @pytest.mark.slow
-def test_overlay_has_dots_in_place_and_enlarged_arrows(checked: Checked) -> None:
+def test_overlay_has_dots_in_place_and_enlarged_arrows(checked: CheckResult) -> None:
     (picture,) = checked.record.pictures
     overlay = presenter.overlay(picture, 640)
     factor = float(overlay.words.split("×")[1].split(",")[0])
@@ -168,7 +170,7 @@ def test_overlay_has_dots_in_place_and_enlarged_arrows(checked: Checked) -> None
 
 
 def test_dark_pictures_are_rejected_with_the_cause() -> None:
-    dark = Chosen("dark.png", np.zeros((640, 480), np.uint8))
+    dark = ListedPicture("dark.png", np.zeros((640, 480), np.uint8))
     text = SETUP.read_text("utf-8")
     with pytest.raises(CannotMeasure, match=r"dark\.png"):
         presenter.check([dark], (text, SETUP), DotSettings(), lambda *_: None)
@@ -200,7 +202,7 @@ def test_picture_set_without_dots_is_reported(
 
 
 def test_picture_of_another_size_is_rejected(tmp_path: Path) -> None:
-    one, other = (Chosen(str(n), np.zeros((n, 48), np.uint8)) for n in (64, 32))
+    one, other = (ListedPicture(str(n), np.zeros((n, 48), np.uint8)) for n in (64, 32))
     with Session.create(tmp_path / "new.labsession") as session:
         presenter.check_sizes(session, [one, one])
         with pytest.raises(CannotMeasure, match="48 × 32"):
@@ -254,6 +256,22 @@ def test_pictures_are_listed_edited_and_removed(
     page.remove_button.click()
     assert [one.mirror for one in page.chosen] == [Plate(0.0)]
     assert not page.diameter.editor.isEnabled()
+
+
+def test_entered_uncertainties_can_be_cleared(
+    qtbot: QtBot, page: BenchCheckPage, tmp_path: Path
+) -> None:
+    add(qtbot, page, tmp_path, np.zeros((64, 48), np.uint8))
+    for field in (page.mirror_form.height_sigma, page.mirror_form.level):
+        field.editor.selectAll()
+        qtbot.keyClicks(field.editor, "0.02")
+        field.flush()
+    assert (page.chosen[0].height_sigma_mm, page.chosen[0].level_sigma_deg) == (0.02, 0.02)
+    for field in (page.mirror_form.height_sigma, page.mirror_form.level):
+        field.editor.clear()
+        field.flush()
+        assert field.problem.isHidden()
+    assert (page.chosen[0].height_sigma_mm, page.chosen[0].level_sigma_deg) == (None, None)
 
 
 def test_only_pictures_can_be_dropped(qtbot: QtBot, page: BenchCheckPage, tmp_path: Path) -> None:
@@ -324,7 +342,7 @@ def test_bench_check_is_applied_stored_and_undone(
 
 @pytest.mark.slow
 def test_stored_check_is_shown_when_its_session_is_opened(
-    qtbot: QtBot, page: BenchCheckPage, checked: Checked
+    qtbot: QtBot, page: BenchCheckPage, checked: CheckResult
 ) -> None:
     workspace, path = page.workspace, page.session.path
     image = checked.chosen[0].image
@@ -342,7 +360,7 @@ def test_stored_check_is_shown_when_its_session_is_opened(
 
 @pytest.mark.slow
 def test_rejected_check_shows_suspects_and_no_measured_mirror(
-    page: BenchCheckPage, checked: Checked
+    page: BenchCheckPage, checked: CheckResult
 ) -> None:
     """Mirrors measured with a rejected bench would look right."""
     page.chosen = list(checked.chosen)
@@ -379,7 +397,7 @@ def test_table_moves_below_the_picture_in_a_narrow_page(
 
 
 @pytest.mark.slow
-def test_quantity_found_from_pictures_alone_is_reported(checked: Checked) -> None:
+def test_quantity_found_from_pictures_alone_is_reported(checked: CheckResult) -> None:
     free = replace(checked, check=replace(checked.check, free=("laser.distance_mm",)))
     assert "distance" not in checked.words
     assert "distance" in free.words
@@ -392,7 +410,7 @@ def test_every_button_has_a_tooltip(page: BenchCheckPage) -> None:
 
 
 @pytest.mark.slow
-def test_unchecking_restores_the_previous_uncertainty(checked: Checked) -> None:
+def test_unchecking_restores_the_previous_uncertainty(checked: CheckResult) -> None:
     known = {"projection_angle_deg_sigma": 0.3, "angle_distance_correlation": 0.9}
     text = updated_setup(SETUP.read_text("utf-8"), SETUP, {"laser": known})
     check = replace(checked.check, before=parse_setup(text, SETUP).rig)

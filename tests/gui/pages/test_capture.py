@@ -53,7 +53,7 @@ def stack(tmp_path: Path) -> Path:
 def test_preview_and_choice_of_frames(stack: Path, copy_sample) -> None:
     preview = Preview(stack)
     assert preview.frames == 12
-    assert Choice(2, 9, 3).frames == "2:10:3"
+    assert Choice(2, 9, 3).options["frames"] == "2:10:3"
     assert Choice(2, 9, 3).count == 3
     assert choice_text(preview, Choice(0, 11)) == (
         "12 of 12 frames; without a frame rate there are no times"

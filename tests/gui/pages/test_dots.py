@@ -17,8 +17,9 @@ from pytestqt.qtbot import QtBot
 from labapp.core.pipeline import start_correction
 from labapp.core.rows.correction import Correction, add_dot, delete_dots, shift_row
 from labapp.errors import InputError
-from labapp.gui.pages.dots import DotsPage, presenter
+from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.fitting import Processes, Refit
+from labapp.gui.pages.dots.page import DotsPage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tasks import Control
 from labapp.gui.workspace import Workspace
@@ -68,7 +69,7 @@ def show(page: DotsPage, qtbot: QtBot, path: Path, frame: int) -> Session:
     page.workspace.show_frame(frame)
     session = page.workspace.session
     assert session is not None
-    qtbot.waitUntil(lambda: page.looking.frame == frame and page.editor.correction is not None)
+    qtbot.waitUntil(lambda: page.reader.frame == frame and page.editor.correction is not None)
     let_draw()
     return session
 
@@ -399,7 +400,7 @@ def test_rejected_edit_is_reported_and_changes_nothing(
     page.editor.choose_rows([4])
     page.dots_panel.row.edited.emit(5)  # occupied by other dots
     assert [problem for _, problem in messages] == [True] * 6
-    assert "no dot is selected" in messages[0][0]
+    assert "Select a dot first" in messages[0][0]
     assert "already assigned" in messages[-1][0]
     assert len(session.history) == steps
     assert unfitted == []
@@ -548,7 +549,7 @@ def test_presenter_of_a_session(copy_sample: CopySample) -> None:
     with Session.open(copy_sample("blocked_rows")) as session:
         shown = presenter.shown(session, 0, None)
         assert shown.origin == "measured"
-        assert presenter.wanted(session, 0) is None
+        assert not presenter.needs_dots(session, 0)
         assert shown.correction is not None
         # Computed dots agree with the captured ones, because the surface fits.
         distances = np.linalg.norm(
@@ -603,8 +604,8 @@ def test_fast_frame_changes_show_matching_dots(
     qtbot.waitUntil(lambda: page.seen is not None and page.seen.frame == numbers[-1])
     # The results have other settings, so dots are detected once, at the end.
     qtbot.waitUntil(lambda: origin(page) == "found")
-    assert page.looking.found is not None
-    assert page.looking.found.frame == numbers[-1]
+    assert page.reader.found is not None
+    assert page.reader.found.frame == numbers[-1]
 
 
 def test_damaged_result_is_reported_and_dots_are_detected(

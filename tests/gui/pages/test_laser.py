@@ -12,7 +12,8 @@ from PySide6.QtCore import QItemSelectionModel, Qt
 from pytestqt.qtbot import QtBot
 
 from labapp.core.calibration.laser_calibration import calibrate_laser
-from labapp.gui.pages.laser import LaserPage, presenter
+from labapp.gui.pages.laser import presenter
+from labapp.gui.pages.laser.page import LaserPage
 from labapp.gui.pages.laser.presenter import ENDS, SCALE, Readings
 from labapp.gui.shell.steps import states
 from labapp.gui.workspace import Workspace
@@ -139,7 +140,7 @@ def fill(page: LaserPage, row: int, texts: tuple[str, ...]) -> None:
 
 
 def presenter_cell(text: str):
-    from labapp.gui.pages.laser.view import _cell
+    from labapp.gui.pages.laser.page import _cell
 
     return _cell(text)
 
@@ -177,6 +178,22 @@ def test_table_grows_and_delete_clears_cells(qtbot: QtBot, page: LaserPage) -> N
     select_only = QItemSelectionModel.SelectionFlag.ClearAndSelect
     page.table.setCurrentCell(rows - 1, 0, select_only)
     qtbot.keyClick(page.table, Qt.Key.Key_Delete)
+    assert page.readings().lengths_mm[0] == ()
+
+
+def test_length_in_the_drawing_replaces_the_reading_of_any_row(
+    qtbot: QtBot, page: LaserPage
+) -> None:
+    clear(page)
+    fill(page, 1, ("5", "", ""))
+    field = page.length_fields[0]
+    field.editor.selectAll()
+    qtbot.keyClicks(field.editor, "6")
+    field.flush()
+    assert page.readings().lengths_mm[0] == (6.0,)
+    assert field.editor.isEnabled()
+    field.editor.clear()
+    field.flush()
     assert page.readings().lengths_mm[0] == ()
 
 

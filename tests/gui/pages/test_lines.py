@@ -14,9 +14,9 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QHBoxLayout, QWidget
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.dots.fitting import Processes, Refit
-from labapp.gui.pages.dots.lines import show_lines
+from labapp.gui.pages.dots.line_presenter import show_lines
+from labapp.gui.pages.dots.page import DotsPage
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT, SAMPLES, let_draw
@@ -60,7 +60,7 @@ def page(qtbot: QtBot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
     qtbot.waitExposed(container)
     workspace.show(Session.open(tmp_path / "lines.labsession"))
     page.refresh()
-    qtbot.waitUntil(lambda: len(page.lines_hand.state.lines) == 3)
+    qtbot.waitUntil(lambda: len(page.line_tool.state.lines) == 3)
     let_draw()
     page.view.setFocus()
     yield page
@@ -81,7 +81,7 @@ def press(page: DotsPage, key: Qt.Key, modifier: Qt.KeyboardModifier = NONE) -> 
 
 
 def lines(page: DotsPage) -> list[str]:
-    return [line.name for line in page.lines_hand.state.lines]
+    return [line.name for line in page.line_tool.state.lines]
 
 
 def test_cut_join_number_and_delete_can_each_be_undone(page: DotsPage) -> None:
@@ -92,17 +92,17 @@ def test_cut_join_number_and_delete_can_each_be_undone(page: DotsPage) -> None:
     assert lines(page) == ["(1)", "(2)", "(3)", "(4)"]
     click(page, 170, 345)
     click(page, 310, 345, SHIFT)
-    assert len(page.lines_hand.chosen) == 2
+    assert len(page.line_tool.chosen) == 2
     press(page, Qt.Key.Key_J)
     assert len(lines(page)) == 3
     click(page, 240, 400)
-    page.lines_hand.number(2)
+    page.line_tool.number(2)
     assert lines(page)[0] == "2"
     click(page, 240, 280)
     press(page, Qt.Key.Key_Delete)
     assert len(lines(page)) == 2
     assert session.corrected_frames().tolist() == [0]
-    assert page.lines_hand.state.due
+    assert page.line_tool.state.due
     assert [change.label.split(",")[0] for change in session.history][-4:] == [
         *("cut a line", "join two lines", "number a line", "delete lines")
     ]
@@ -118,7 +118,7 @@ def test_buttons_without_their_selection_are_disabled(page: DotsPage) -> None:
     assert not buttons["Join"].isEnabled()
     assert not buttons["Back to automatic"].isEnabled()
     page.lines_panel.lines.selectAll()
-    assert page.lines_hand.chosen == [0, 1, 2]
+    assert page.line_tool.chosen == [0, 1, 2]
     assert buttons["Delete"].isEnabled()
     assert not buttons["Join"].isEnabled()
 
@@ -132,8 +132,8 @@ def test_corrected_frame_is_measured_with_its_correction(page: DotsPage) -> None
     for _ in session.measure():
         pass
     page.refresh()
-    assert not page.lines_hand.state.due
-    assert page.lines_hand.state.by_hand
+    assert not page.line_tool.state.due
+    assert page.line_tool.state.by_hand
     assert len(lines(page)) == 2
     press(page, Qt.Key.Key_Backspace, Qt.KeyboardModifier.ControlModifier)
     assert len(lines(page)) == 3

@@ -19,7 +19,8 @@ from labapp.core.calibration.boards import BOARDS
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
-from labapp.gui.pages.plane import PlanePage, presenter
+from labapp.gui.pages.plane import presenter
+from labapp.gui.pages.plane.page import PlanePage
 from labapp.gui.shell.steps import calibrations_in_use, states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session

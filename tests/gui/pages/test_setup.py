@@ -20,7 +20,8 @@ from labapp.config.setup_keys import SECTIONS
 from labapp.core.geometry.line_pattern import LinePattern, LineRays
 from labapp.core.geometry.rig import DotPattern
 from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, POINTS, QUANTITIES
-from labapp.gui.pages.setup import SetupPage, presenter
+from labapp.gui.pages.setup import presenter
+from labapp.gui.pages.setup.page import SetupPage
 from labapp.gui.pages.setup.presenter import RIG
 from labapp.gui.views.drawings.bench import DRAWN
 from labapp.gui.views.drawings.pattern import PatternView

@@ -14,7 +14,7 @@ from labapp.gui.pages.surface.presenter import Options
 from labapp.gui.shell.steps import why_not_measurable
 from labapp.session.results.measured import scheme_name
 from labapp.session.session import Session
-from labapp.text import SETUP_MARKS
+from labapp.text import SETUP_MARKS, local_time
 from tests.gui.conftest import CopySample
 
 
@@ -53,11 +53,15 @@ def test_provenance_text(session: Session) -> None:
     words = presenter.provenance(result)
     assert words.startswith("Frame 3 · Fit · dots found automatically · labapp ")
     assert result.version in words
-    assert result.measured[:10] in words
+    assert local_time(result.measured) in words
     by_hand = replace(
         result, measurement=replace(result.measurement, correction=object()), scheme="irs-opa"
     )
     assert "IRS, one point (OPA) · dots corrected by hand" in presenter.provenance(by_hand)
+    lines = replace(result, measurement=replace(result.measurement, lines=object()))
+    assert "lines found automatically" in presenter.provenance(lines)
+    lines = replace(lines, measurement=replace(lines.measurement, correction=object()))
+    assert "lines corrected by hand" in presenter.provenance(lines)
 
 
 def test_tried_correspondences_are_listed(session: Session) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from labapp.core.bench_check.mirrors import Plate
-from labapp.gui.pages.bench_check.chosen import KINDS, Chosen
+from labapp.gui.pages.bench_check.listed_picture import KINDS, ListedPicture
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 
 
@@ -21,7 +21,9 @@ class MirrorForm(FieldForm):
         Called with the picture when its mirror was changed.
     """
 
-    def __init__(self, selected: Callable[[], Chosen], change: Callable[[Chosen], object]) -> None:
+    def __init__(
+        self, selected: Callable[[], ListedPicture], change: Callable[[ListedPicture], object]
+    ) -> None:
         super().__init__()
         tip = "Which mirror the selected picture shows"
         self.kind = ChoiceField("Mirror", KINDS, tooltip=tip)
@@ -54,6 +56,7 @@ class MirrorForm(FieldForm):
             step=0.005,
             decimals=4,
             tooltip="Standard uncertainty of the height; empty: the usual one, in grey",
+            optional=True,
         )
         self.height_sigma.edited.connect(
             lambda value: change(replace(selected(), height_sigma_mm=value))
@@ -67,6 +70,7 @@ class MirrorForm(FieldForm):
             decimals=3,
             tooltip="How level the plate lies on the work piece, either way, one standard "
             "uncertainty; empty: the usual one, in grey. It limits what a check can do",
+            optional=True,
         )
         self.level.edited.connect(lambda value: change(replace(selected(), level_sigma_deg=value)))
         for field in self.fields:
@@ -77,12 +81,7 @@ class MirrorForm(FieldForm):
         """All fields in order."""
         return self.kind, self.diameter, self.height_field, self.height_sigma, self.level
 
-    def flush(self) -> None:
-        """Finish an edit in progress."""
-        for field in (self.diameter, self.height_field, self.height_sigma, self.level):
-            field.flush()
-
-    def show_mirror(self, one: Chosen | None, locked: str) -> None:
+    def show_mirror(self, one: ListedPicture | None, locked: str) -> None:
         """Show the mirror of a picture, or none. ``locked``: reason why changes are refused."""
         for field in self.fields:
             field.lock(locked or ("" if one else "Add a picture first"))

@@ -32,7 +32,7 @@ from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.images.find_dots import DotSettings, find_mirror_dots
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.gui.digits import plain, round_factor, with_sigma
-from labapp.gui.pages.bench_check.chosen import Chosen
+from labapp.gui.pages.bench_check.listed_picture import ListedPicture
 from labapp.media.formats.images import IMAGE_SUFFIXES
 from labapp.session.record import BenchCheckRecord, MirrorPicture, Record
 from labapp.session.session import Session
@@ -51,10 +51,10 @@ Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Checked:
+class CheckResult:
     """A check made on this page."""
 
-    chosen: tuple[Chosen, ...]
+    chosen: tuple[ListedPicture, ...]
     setup_text: str
     """The pictures and the set-up used."""
     check: BenchCheck
@@ -114,13 +114,13 @@ class Checked:
 
 
 def check(
-    chosen: Sequence[Chosen],
+    chosen: Sequence[ListedPicture],
     setup_file: tuple[str, Path],
     settings: DotSettings,
     progress: Progress,
     free: Sequence[str] = (),
     pool: Cap = EXPECTED,
-) -> Checked:
+) -> CheckResult:
     """Adjust the set-up to pictures of known mirrors; `CannotMeasure` gives a reason.
 
     Parameters
@@ -157,10 +157,10 @@ def check(
     values = {name: np.array([getattr(one, name) for one in changes]) for name in columns}
     keys = tuple(one.key for one in changes)
     record = BenchCheckRecord(now(), tuple(kept), keys, **values, free=tuple(free))
-    return Checked(tuple(chosen), text, found, record, *_of_pool(found, pool))
+    return CheckResult(tuple(chosen), text, found, record, *_of_pool(found, pool))
 
 
-def check_sizes(session: Session, chosen: Sequence[Chosen]) -> None:
+def check_sizes(session: Session, chosen: Sequence[ListedPicture]) -> None:
     """Raise `CannotMeasure` if the size of a picture differs from that of the camera's others.
 
     These are the recording, the picture of the imaging plane, or the first in the list.
@@ -195,7 +195,7 @@ def _of_pool(
 
 
 def _kept(
-    one: Chosen, checked: CheckedPicture, found: BenchCheck, before: ImageCalibration
+    one: ListedPicture, checked: CheckedPicture, found: BenchCheck, before: ImageCalibration
 ) -> MirrorPicture:
     dots = checked.picture.dots
     dot_px = np.column_stack([dots.u_px, dots.v_px])[checked.dot]
@@ -256,14 +256,13 @@ class QuantityRow:
     """Object to which the quantity belongs."""
     texts: tuple[str, str, str, str, str]
     """Name, value ± before, value ± after, unit, and whether the pictures determine it."""
-    determined: bool
 
 
 COLUMNS = ("Quantity", "Before", "After", "Unit", "")
 
 DETERMINED, NOT_DETERMINED = "●", "○"
 
-KEY = (
+LEGEND = (
     f"±: standard uncertainty. {DETERMINED} determined by the pictures; {NOT_DETERMINED} hardly: "
     f"its ± is still more than {UNDETERMINED:.0%} of that before"
 ).replace("%", " %")
@@ -293,7 +292,7 @@ def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
             one.unit,
             DETERMINED if determined else NOT_DETERMINED,
         )
-        rows.append(QuantityRow(_sentence(group, ""), texts, determined))
+        rows.append(QuantityRow(_sentence(group, ""), texts))
     groups = list(dict.fromkeys(row.group for row in rows))  # later quantities join their group
     return tuple(sorted(rows, key=lambda row: groups.index(row.group)))
 

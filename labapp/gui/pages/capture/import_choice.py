@@ -9,7 +9,7 @@ from PySide6.QtCore import Signal
 from labapp.gui.pages.capture.presenter import Choice, Preview, choice_text, refusal
 from labapp.gui.widgets.buttons import button, check_box
 from labapp.gui.widgets.fields import FieldForm, NumberField, whole
-from labapp.gui.widgets.labels import Message, plain_tip, selectable_label
+from labapp.gui.widgets.labels import Message, allow, selectable_label
 from labapp.gui.widgets.layouts import Group, fill, hbox
 from labapp.session.session import Session
 
@@ -112,13 +112,10 @@ class ImportChoice(Group):
         self.setVisible(preview is not None)
         has_one = session is not None and session.recording is not None
         wants_own = has_one and measured
-        self.import_button.setEnabled(not (why_not or wants_own))
         self.import_button.setDefault(not wants_own)
         self.next_button.setDefault(wants_own)
-        tip = why_not or (
-            MEASURED if wants_own else "Read it once from end to end, and add its frames"
-        )
-        self.import_button.setToolTip(plain_tip(tip))
+        tip = "Read it once from end to end, and add its frames"
+        allow(self.import_button, tip, why_not or (MEASURED if wants_own else ""))
         if preview is not None and choice is not None:
             words = choice_text(preview, choice)
             self.choice_words.setText(f"{words}. {why_not}" if why_not else words)

@@ -18,7 +18,7 @@ from labapp.gui.pages.capture.kept_recordings import KeptRecordings, kept_text
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
-    Seen,
+    ShownFrame,
     look,
     missing_text,
     recording_facts,
@@ -154,7 +154,7 @@ class CapturePage(Page):
             self.exposure.hide()
         else:
             self._drop_preview()
-            self._show_seen(Seen(f"Live: {live.name}", None, None, "Opening the camera…"))
+            self._show_seen(ShownFrame(f"Live: {live.name}", None, None, "Opening the camera…"))
         self.refresh()
         self.workspace.changed.emit()
 
@@ -174,7 +174,7 @@ class CapturePage(Page):
             self.confirm(kept_text(take, why_kept))
         else:
             measured = self.live_view.plan_fields.measured.isChecked()
-            self._import(take.path, ":", None, False, self._measure if measured else _nothing)
+            self._import(take.path, None, self._measure if measured else _nothing)
 
     def _show_recording(self, recording: Recording | None) -> None:
         self.facts_group.setVisible(recording is not None and self.live_view.live is None)
@@ -212,7 +212,7 @@ class CapturePage(Page):
             self._listed = session
             self.kept.list_beside(session, self.live_view.recording)
 
-    def _show_seen(self, seen: Seen) -> None:
+    def _show_seen(self, seen: ShownFrame) -> None:
         self.title.setText(seen.title)
         self.picture_view.show_picture(seen.image, seen.words)
         if seen.exposure is None:
@@ -237,7 +237,7 @@ class CapturePage(Page):
             self._wanted = (None, self.workspace.frame)
         else:
             self._wanted = self._seen = None
-            self._show_seen(Seen("", None, None))
+            self._show_seen(ShownFrame("", None, None))
             return
         if self._wanted != self._seen and self._reading not in self.workspace.tasks.active:
             self._read()
@@ -253,12 +253,12 @@ class CapturePage(Page):
             return
         preview, number = wanted
 
-        def work(_: Control) -> Seen:
+        def work(_: Control) -> ShownFrame:
             if preview is not None:
                 return preview.look(number, session.settings.dots if judged else None)
             return look(session, number, judged)
 
-        def done(seen: Seen) -> None:
+        def done(seen: ShownFrame) -> None:
             if self.workspace.session is not session or self.live_view.live is not None:
                 return
             self._seen = wanted
@@ -304,7 +304,7 @@ class CapturePage(Page):
             self.chosen.begin(preview)
             self._look()
             if at_once:
-                self._import(path, ":", None, False, self._go_to_dots)
+                self._import(path, None, self._go_to_dots)
             self._show_import()
             self.workspace.changed.emit()
 
@@ -320,34 +320,29 @@ class CapturePage(Page):
         """Import the chosen frames in the background."""
         preview, choice = self.preview, self.choice()
         if preview is not None and choice is not None and choice.count:
-            self._import(preview.path, choice.frames, choice.rate_hz, choice.embed)
+            self._import(preview.path, choice)
 
     def begin_next(self) -> None:
         """Import the chosen frames into a new session with the same set-up."""
         preview, choice = self.preview, self.choice()
         if preview is not None and choice is not None and choice.count:
-            self._import_next(preview.path, choice.frames, choice.rate_hz, choice.embed)
+            self._import_next(preview.path, choice)
 
-    def _import_next(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
+    def _import_next(self, path: Path, choice: Choice | None) -> None:
         former = self.workspace.session
         self.workspace.next_session_requested.emit(path)
         if self.workspace.session is not former:  # the dialog was not cancelled
-            self._import(path, frames, rate_hz, embed)
+            self._import(path, choice)
 
     def _import(
-        self,
-        path: Path,
-        frames: str,
-        rate_hz: float | None,
-        embed: bool,
-        then: Callable[[], None] = _nothing,
+        self, path: Path, choice: Choice | None, then: Callable[[], None] = _nothing
     ) -> None:
+        """Import the chosen frames of a recording in the background; None: all of them."""
         session = self.session
+        options = {} if choice is None else choice.options
 
         def work(control: Control) -> Recording:
-            recording = session.import_recording(
-                path, frames, frame_rate_hz=rate_hz, embed=embed, progress=control.progress
-            )
+            recording = session.import_recording(path, **options, progress=control.progress)
             session.overview()  # read in this thread: the window would wait for it
             return recording
 
@@ -438,9 +433,7 @@ class CapturePage(Page):
         keep_room(self.exposure)
         self.foot_switch = FootSwitchPanel(self.workspace.foot_switches)
         # Below the other buttons, as it appears when a recording ends.
-        self.kept = KeptRecordings(
-            self.take, lambda path: self._import_next(path, ":", None, False)
-        )
+        self.kept = KeptRecordings(self.take, lambda path: self._import_next(path, None))
         self.facts = QGridLayout()  # a form layout keeps old heights, which cuts off lines
         self.facts.setColumnStretch(1, 1)
         self.facts_group = Group("What was read", self.facts)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from labapp.core.images.exposure import Exposure, judge_exposure
 from labapp.core.images.find_dots import DotSettings, find_dots
@@ -16,11 +16,11 @@ from labapp.media import GreyImage, open_source
 from labapp.media.base import format_frame_rate
 from labapp.session.record import Recording
 from labapp.session.session import Session
-from labapp.text import format_bytes
+from labapp.text import format_bytes, local_time
 
 
 @dataclass(frozen=True)
-class Seen:
+class ShownFrame:
     """A frame to show."""
 
     title: str
@@ -50,16 +50,16 @@ class Preview:
         self.description = self._source.description
         self.warnings = self._source.warnings
 
-    def look(self, number: int, settings: DotSettings | None) -> Seen:
+    def look(self, number: int, settings: DotSettings | None) -> ShownFrame:
         """Read a frame, and assess its exposure if there are settings to find dots."""
         title = f"{self.path.name}, frame {number} (of 0 to {self.frames - 1}), not imported yet"
         with self._turn:
             try:
                 image = self._source.frame(number).image
             except InputError as error:
-                return Seen(title, None, None, str(error))
+                return ShownFrame(title, None, None, str(error))
             depth = self._source.bit_depth
-        return Seen(title, image, _judged(image, settings, depth))
+        return ShownFrame(title, image, _judged(image, settings, depth))
 
     def close(self) -> None:
         """Close the file."""
@@ -67,16 +67,18 @@ class Preview:
             self._source.close()
 
 
-def look(session: Session, number: int, judged: bool = True) -> Seen:
+def look(session: Session, number: int, judged: bool = True) -> ShownFrame:
     """Read a frame of the session and, if ``judged``, assess its exposure."""
     recording = session.recording
     title = f"Frame {number} of the session"
     try:
         image = session.frame(number).image
     except InputError as error:
-        return Seen(title, None, None, recording_gone(session) or str(error))
+        return ShownFrame(title, None, None, recording_gone(session) or str(error))
     depth = None if recording is None else recording.bit_depth
-    return Seen(title, image, _judged(image, session.settings.dots if judged else None, depth))
+    return ShownFrame(
+        title, image, _judged(image, session.settings.dots if judged else None, depth)
+    )
 
 
 def _judged(
@@ -105,9 +107,10 @@ class Choice:
     """Whether the frames are stored in the session."""
 
     @property
-    def frames(self) -> str:
-        """The frames in the form required by `Session.import_recording`."""
-        return f"{self.first}:{self.last + 1}:{self.every}"
+    def options(self) -> dict[str, Any]:
+        """The choice as arguments of `Session.import_recording`."""
+        frames = f"{self.first}:{self.last + 1}:{self.every}"
+        return {"frames": frames, "frame_rate_hz": self.rate_hz, "embed": self.embed}
 
     @property
     def count(self) -> int:
@@ -161,11 +164,6 @@ def recording_facts(recording: Recording) -> tuple[tuple[str, str], ...]:
         ("SHA-256", recording.sha256),
         ("Imported", local_time(recording.imported)),
     )
-
-
-def local_time(iso: str) -> str:
-    """Text of an ISO 8601 time in local time."""
-    return f"{datetime.fromisoformat(iso).astimezone():%Y-%m-%d %H:%M}"
 
 
 def missing_text(session: Session) -> str:

@@ -24,7 +24,10 @@ NOTHING: IntArray = np.zeros(0, np.int64)
 
 
 class Editor:
-    """Editing of one frame: selection, drag in progress, and edits."""
+    """Editing of one frame: selection, drag in progress, and edits.
+
+    The edits expect that what they need is there, see `presenter.unmet_need`.
+    """
 
     def __init__(self, commit: Commit) -> None:
         self._commit = commit
@@ -157,7 +160,7 @@ class Editor:
         """Set the row and column of the selected dots from their neighbours."""
         chosen = self.selection
         label = f"number {_count(chosen)}"
-        return self._edit(label, lambda c: picking.numbered_by_neighbours(c, _some(chosen)))
+        return self._edit(label, lambda c: picking.numbered_by_neighbours(c, chosen))
 
     def put_in_doubt(self) -> bool:
         """Mark the selected dots as doubtful: without row and column."""
@@ -170,7 +173,7 @@ class Editor:
 
         def edit(correction: Correction) -> Correction:
             # Each shift may renumber rows, so all start from the original numbers.
-            for row in _wanted(rows):
+            for row in rows:
                 correction = core.shift_row(correction, row, columns)
             return correction
 
@@ -182,8 +185,6 @@ class Editor:
         chosen = self.selection
 
         def edit(correction: Correction) -> Correction:
-            if len(chosen) != 1 or not correction.sited[chosen[0]]:
-                raise ValueError("select one dot that has a row: the row is split at it")
             dot = int(chosen[0])
             lattice = correction.lattice
             return core.split_row(
@@ -195,13 +196,9 @@ class Editor:
     def merge(self) -> bool:
         """Merge the two rows of the selected dots."""
         rows = self.rows
-
-        def edit(correction: Correction) -> Correction:
-            if len(rows) != 2:
-                raise ValueError("select dots of the two rows to merge")
-            return core.merge_rows(correction, rows[1], into=rows[0])
-
-        return self._edit(f"merge {_named(rows)}", edit)
+        return self._edit(
+            f"merge {_named(rows)}", lambda c: core.merge_rows(c, rows[1], into=rows[0])
+        )
 
     def block(self) -> bool:
         """Mark the rows of the selected dots as blocked by the torch, or unmark them if all are."""
@@ -209,7 +206,7 @@ class Editor:
         marked = correction is not None and set(rows) <= correction.lattice.blocked_rows
 
         def edit(correction: Correction) -> Correction:
-            for row in _wanted(rows):
+            for row in rows:
                 correction = core.block_row(correction, row, not marked)
             return correction
 
@@ -243,18 +240,6 @@ class Editor:
             return edit(correction)
 
         return self._commit(label, made)
-
-
-def _some(dots: IntArray) -> IntArray:
-    if not len(dots):
-        raise ValueError("no dot is selected")
-    return dots
-
-
-def _wanted(rows: list[int]) -> list[int]:
-    if not rows:
-        raise ValueError("select a row, or a dot that has one")
-    return rows
 
 
 def _count(dots: IntArray) -> str:

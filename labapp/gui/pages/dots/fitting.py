@@ -133,7 +133,7 @@ class Refit:
 
         def work(control: Control) -> None:
             try:
-                for _ in session.measure_each([frame], _Patient(pool, control)):
+                for _ in session.measure_each([frame], _CancellablePool(pool, control)):
                     control.check()
             except BrokenProcessPool as error:
                 control.check()  # raises if it was ended on purpose
@@ -149,7 +149,7 @@ class Refit:
         self.processes.end()
 
 
-class _Patient(Executor):
+class _CancellablePool(Executor):
     """A pool whose results are waited for only until the task is cancelled."""
 
     def __init__(self, pool: Executor, control: Control) -> None:

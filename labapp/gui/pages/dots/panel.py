@@ -28,12 +28,7 @@ from labapp.gui.pages.dots.presenter import (
 from labapp.gui.shell.lead import action_grid
 from labapp.gui.shell.steps import MEASURE_ACTIONS, SETUP_ACTIONS
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import (
-    Message,
-    heading,
-    plain_label,
-    plain_tip,
-)
+from labapp.gui.widgets.labels import Message, allow, heading, plain_label
 from labapp.gui.widgets.layouts import Group, reveal, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
@@ -56,8 +51,7 @@ class MeasureLead(QStackedWidget):
     def offer(self, without_setup: bool, why_not: str) -> None:
         """Offer one of the two; disabled if neither is possible."""
         self.setCurrentIndex(int(without_setup))
-        self.setEnabled(not why_not)
-        self.setToolTip(plain_tip(why_not))
+        allow(self, "", why_not)
 
 
 class DotsPanel(QWidget):
@@ -121,8 +115,8 @@ class DotsPanel(QWidget):
             Whether the button with the focus is among them.
         """
         focused = False
-        for words, why in unmet_need.items():
-            button = self.buttons[words]
+        for words, button in self.buttons.items():
+            why = unmet_need[words]
             focused |= bool(why) and button.hasFocus()
             button.setEnabled(not why)
             tip = button.defaultAction().toolTip()
@@ -243,11 +237,8 @@ class _RowList(ReadTable):
         chosen = self.chosen()
         with QSignalBlocker(self):
             self._numbers = [line.row for line in lines]
-            self.setRowCount(len(lines))
-            for k, line in enumerate(lines):
-                texts = (str(line.row or "–"), str(line.dots), line.columns, line.note)
-                for column, text in enumerate(texts):
-                    self.set_cell(k, column, text, number=column < 3)
+            texts = [(str(x.row or "–"), str(x.dots), x.columns, x.note) for x in lines]
+            self.show_texts(texts, words=(3,))
         self.choose(chosen)
         self.resizeRowsToContents()
         # Widgets below must not jump from frame to frame.

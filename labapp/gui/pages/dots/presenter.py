@@ -28,9 +28,6 @@ NO_PLACES: FloatArray = np.zeros((0, 2))
 
 NO_DOTS = "Lower the detector's threshold below, add dots, or record with more light."
 
-Wanted = tuple[int, DotSettings, LatticeSettings]
-"""A frame, and the settings for detecting its dots and rows."""
-
 Origin = Literal["corrected", "measured", "found", "looked for"]
 
 
@@ -109,12 +106,12 @@ def shown(session: Session, frame: int, found: DetectedDots | None) -> DotsState
     return DotsState(frame, "looked for", None, NO_PLACES, result, damage)
 
 
-def wanted(session: Session, frame: int) -> Wanted | None:
-    """Detection needed for a frame; None if the session has its dots."""
+def needs_dots(session: Session, frame: int) -> bool:
+    """Whether dots of a frame must be detected, because the session has none."""
     if session.correction(frame) is not None:
-        return None
-    by, result = _by(session), _result(session, frame)[0]
-    return None if result is not None and _automatic(result, by) else (frame, *by)
+        return False
+    result = _result(session, frame)[0]
+    return result is None or not _automatic(result, _by(session))
 
 
 def _result(session: Session, frame: int) -> tuple[Result | None, str]:

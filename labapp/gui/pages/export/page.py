@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from PySide6.QtCore import QUrl
 from PySide6.QtGui import QDesktopServices
@@ -32,8 +33,8 @@ from labapp.gui.pages.export.sizes import estimated_bytes
 from labapp.gui.pages.page import Page
 from labapp.gui.tasks import DONE, PROBLEM, Control, Task
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, whole
-from labapp.gui.widgets.labels import Message, heading, keep_room, plain_tip, wrapping_label
+from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, whole
+from labapp.gui.widgets.labels import Message, allow, heading, keep_room, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox, scrolled, vbox
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
@@ -120,12 +121,8 @@ class ExportPage(Page):
         writing = self._writing in active
         measuring = self.workspace.measuring is not None
         why_not = "Writing…" if writing else made.why_not
-        self.export_button.setEnabled(not why_not)
-        self.export_button.setToolTip(
-            plain_tip(
-                why_not or "Write all that is ticked; a cancelled export leaves nothing behind"
-            )
-        )
+        tip = "Write all that is ticked; a cancelled export leaves nothing behind"
+        allow(self.export_button, tip, why_not)
         recording = self.workspace.session.recording
         size = estimated_bytes(
             self.request,
@@ -157,6 +154,12 @@ class ExportPage(Page):
         self._said = ""
         if self.workspace.session is not None:
             self._show_plan(self.workspace.session)
+
+    def _enter(self, name: str, value: Any) -> None:
+        """Take the value of a field into the request, by its name there."""
+        if name == "size_px":
+            value = tuple(int(side) for side in value.split("x"))
+        self._change_request(**{name: value})
 
     def _ticked(self) -> None:
         self._change_request(
@@ -253,19 +256,13 @@ class ExportPage(Page):
     def _make_panel(self) -> None:
         form = FieldForm()
         self.which = ChoiceField("Frames", WHICH, tooltip="Which frames to write")
-        self.which.edited.connect(lambda key: self._change_request(which=key))
-        self.first = _whole(
-            "From frame", 0, "The first frame to write", "first", self._change_request
-        )
-        self.last = _whole("To frame", 0, "The last frame to write", "last", self._change_request)
-        self.every = _whole(
-            "Every n-th", 1, "1: every frame; 2: every second", "every", self._change_request
-        )
+        self.first = whole("From frame", 0, "The first frame to write")
+        self.last = whole("To frame", 0, "The last frame to write")
+        self.every = whole("Every n-th", 1, "1: every frame; 2: every second")
         self.every.set_value(1)
         self.scheme = ChoiceField(
             "Results of", tooltip="The scheme whose results are written; others must be measured"
         )
-        self.scheme.edited.connect(lambda key: self._change_request(scheme=key))
         self.spacing = NumberField(
             "Grid of surfaces",
             "mm",
@@ -276,14 +273,21 @@ class ExportPage(Page):
             tooltip="Distance of the surfaces' points: finer makes larger files",
         )
         self.spacing.set_value(self.request.spacing_mm)
-        self.spacing.edited.connect(
-            lambda value: self._change_request(spacing_mm=value) if value is not None else None
-        )
         self._make_view_fields()
-        for field in (
-            *(self.which, self.first, self.last, self.every, self.scheme, self.spacing),
-            *(self.view, self.picture_size, self.picture_format, self.rate),
-        ):
+        fields: dict[str, Field] = {
+            "which": self.which,
+            "first": self.first,
+            "last": self.last,
+            "every": self.every,
+            "scheme": self.scheme,
+            "spacing_mm": self.spacing,
+            "view": self.view,
+            "size_px": self.picture_size,
+            "picture_format": self.picture_format,
+            "film_rate_hz": self.rate,
+        }
+        for name, field in fields.items():
+            field.edited.connect(partial(self._enter, name))
             form.add(field)
         self.folder = PathField(
             "Folder",
@@ -312,18 +316,13 @@ class ExportPage(Page):
         self.view = ChoiceField(
             "3-D view", VIEWS, tooltip="Direction of view of pictures of surfaces and of the film"
         )
-        self.view.edited.connect(lambda key: self._change_request(view=key))
         sizes = [(f"{width}x{height}", f"{width} × {height} px") for width, height in SIZES]
         self.picture_size = ChoiceField(
             "Picture size", sizes, tooltip="Of pictures of surfaces and of the film"
         )
-        self.picture_size.edited.connect(
-            lambda key: self._change_request(size_px=tuple(int(side) for side in key.split("x")))
-        )
         self.picture_format = ChoiceField(
             "Frames as", FORMATS, tooltip="Format of the pictures of frames"
         )
-        self.picture_format.edited.connect(lambda key: self._change_request(picture_format=key))
         self.rate = NumberField(
             "Film",
             "frames/s",
@@ -334,12 +333,3 @@ class ExportPage(Page):
             tooltip="How fast the film runs; empty: as fast as the frames were recorded",
             optional=True,
         )
-        self.rate.edited.connect(lambda value: self._change_request(film_rate_hz=value))
-
-
-def _whole(
-    label: str, lowest: int, tip: str, name: str, request: Callable[..., None]
-) -> NumberField:
-    field = whole(label, lowest, tip)
-    field.edited.connect(lambda value: request(**{name: value}) if value is not None else None)
-    return field

@@ -70,6 +70,12 @@ class LaserResult:
         return () if self.found is None else tuple(map(_spoken, self.found.warnings))
 
 
+def length_mm(text: str) -> float | None:
+    """The length in a cell of the table, mm; None if it is none."""
+    value = parsed(text)
+    return value if value is not None and value > 0 else None
+
+
 def typed(
     cells: Mapping[tuple[int, int], str],
     fan_angle_deg: float,
@@ -81,8 +87,8 @@ def typed(
     for (row, column), text in sorted(cells.items()):
         if not text.strip():
             continue
-        value = parsed(text)
-        if value is None or value <= 0:
+        value = length_mm(text)
+        if value is None:
             wrong.append(f"{NAMES[column]}, reading {row + 1}: “{text.strip()}” is not a length")
         else:
             lengths[column].append(value)
@@ -134,25 +140,16 @@ def result(readings: Readings) -> LaserResult:
     return LaserResult(found, "", (*spread, check, *rows))
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """A laser to draw."""
-
-    found: LaserCalibration
-    lengths_mm: tuple[float, float, float]
-    fan_angle_deg: float
-    is_example: bool
-    """Whether it is the laser of `EXAMPLE_MM` because the readings give none."""
-
-
-def drawn(readings: Readings, found: LaserCalibration | None) -> Drawn:
-    """The laser computed from readings, or an example."""
+def drawn(
+    readings: Readings, found: LaserCalibration | None
+) -> tuple[LaserCalibration, tuple[float, float, float], float]:
+    """The laser to draw, l₁, l₂, l₃, mm, and the fan angle; without a laser those of an example."""
     if found is not None:
         l1, l2, l3 = (float(np.mean(lengths)) for lengths in readings.lengths_mm)
-        return Drawn(found, (l1, l2, l3), readings.fan_angle_deg, False)
+        return found, (l1, l2, l3), readings.fan_angle_deg
     l1, l2, l3 = EXAMPLE_MM
     example = calibrate_laser([l1], [l2], [l3], FAN_ANGLE_DEG)
-    return Drawn(example, EXAMPLE_MM, FAN_ANGLE_DEG, True)
+    return example, EXAMPLE_MM, FAN_ANGLE_DEG
 
 
 def in_use(session: Session) -> tuple[ResultRow, ...]:

@@ -294,29 +294,22 @@ def _number(sections: dict[str, Any], key: str) -> float | None:
 
 def rig(session: Session) -> Rig | None:
     """The rig, or None if it is incomplete; the image calibration may be missing."""
-    if not session.setup_problems:
-        return session.setup.rig
-    anything = {"homography": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
-    points = dict.fromkeys(THREE_POINTS)
-    try:
-        text = updated_setup(
-            session.setup_text, session.path, {"image_calibration": points | anything}
-        )
-        return parse_setup(text, session.path, lines=True).rig
-    except InputError:
-        return None
+    return _rig_with(session, {}) if session.setup_problems else session.setup.rig
 
 
 def default_rig(session: Session) -> Rig | None:
     """The rig with dimensions of the dissertation for missing ones; None if a value is wrong."""
-    state = shown(session)
-    anything = {"homography": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
-    values: dict[str, dict[str, object]] = {
-        "image_calibration": dict.fromkeys(THREE_POINTS) | anything
-    }
-    for key in state.missing:
+    values: dict[str, dict[str, object]] = {}
+    for key in shown(session).missing:
         section, _, name = key.partition(".")
         values.setdefault(section, {})[name] = DEFAULTS[key]
+    return _rig_with(session, values)
+
+
+def _rig_with(session: Session, values: dict[str, dict[str, object]]) -> Rig | None:
+    """The rig with some other values, and any image calibration; None if a value is wrong."""
+    anything = {"homography": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
+    values = values | {"image_calibration": dict.fromkeys(THREE_POINTS) | anything}
     try:
         text = updated_setup(session.setup_text, session.path, values)
         return parse_setup(text, session.path, lines=True).rig

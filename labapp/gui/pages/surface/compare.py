@@ -157,4 +157,3 @@ class _FiguresTable(ReadTable):
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         for column in NUMBERS:
             self.horizontalHeader().setSectionResizeMode(column, QHeaderView.ResizeMode.Stretch)
-        self.offer(("Copy table", self.copy_text))

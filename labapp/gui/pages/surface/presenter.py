@@ -18,10 +18,10 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.heights import Profile
 from labapp.export.rendering.scene import Colour, Scene, rays_of, scene_of
-from labapp.gui.digits import ResultRow
+from labapp.gui.digits import ResultRow, round_factor
 from labapp.session.results.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
-from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, marked_setup_words, setup_words
+from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, local_time, marked_setup_words, setup_words
 
 SCHEMES = scheme_words()
 """Stored name of a scheme → text for the operator."""
@@ -100,7 +100,7 @@ class SurfaceState:
     setup_words: str = ""
     """Text of the reliability of the set-up."""
     provenance: str = ""
-    """Frame, scheme, version, time, and whether dots were corrected by hand."""
+    """Frame, scheme, version, time, and whether dots or lines were corrected by hand."""
     sizes: tuple[ResultRow, ...] = ()
     errors: tuple[ResultRow, ...] = ()
     """Rows of the tables; empty without a surface."""
@@ -206,13 +206,12 @@ def _setup_words(result: Result) -> str:
 
 def provenance(result: Result) -> str:
     """Origin of a result in one line."""
+    marks = "dots" if result.measurement.lines is None else "lines"
     by_hand = result.measurement.correction is not None
-    when = result.measured[:16].replace("T", " ")
-    dots = "dots corrected by hand" if by_hand else "dots found automatically"
-    if result.measurement.lines is not None:
-        dots = "lines found automatically"
+    found = f"{marks} {'corrected by hand' if by_hand else 'found automatically'}"
     scheme = SCHEMES[result.scheme].title if result.scheme in SCHEMES else result.scheme
-    return f"Frame {result.frame} · {scheme} · {dots} · labapp {result.version} · {when}"
+    when = local_time(result.measured)
+    return f"Frame {result.frame} · {scheme} · {found} · labapp {result.version} · {when}"
 
 
 def size_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
@@ -351,5 +350,4 @@ def error_scale(captured: FloatArray, computed: FloatArray) -> float:
         return 1.0
     longest = float(np.fmax.reduce(np.linalg.norm(computed - captured, axis=1), initial=0.0))
     wanted = 0.1 * float(np.ptp(captured, axis=0).max()) / max(longest, 1e-9)
-    steps = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0])
-    return float(steps[max(int(np.searchsorted(steps, wanted, side="right")) - 1, 0)])
+    return round_factor(min(max(wanted, 1.0), 1000.0))

@@ -113,7 +113,8 @@ class TrendsPage(Page):
 
     def picture(self) -> QPixmap:
         """The plots without their surroundings."""
-        return QPixmap.fromImage(self.plots.grab_picture())
+        picture: QPixmap = self.plots.canvas.grab()
+        return picture
 
     def _show_signals(self, signals: Signals | None, read_only: bool) -> None:
         self.read_button.setEnabled(not read_only)

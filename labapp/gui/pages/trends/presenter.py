@@ -109,10 +109,7 @@ def show(
         return trend(seen, key, options.without_doubtful, doubtful)
 
     courses = [course_of(key) for key in BY_KEY if key in options.shown]
-    timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
-    at = seen.time_s if timed else seen.frame.astype(float)
-    span = (float(at.min()), float(at.max())) if len(at) else None
-    axis = Axis("Time", "s", span=span) if timed else Axis("Frame", "", 0, span=span)
+    timed, axis, places = _axis(seen)
     curves = [
         _curve(course, events.get(course.quantity.key, ()))
         for course in courses
@@ -125,7 +122,7 @@ def show(
     return TrendsState(
         curves=tuple(curves),
         axis=axis,
-        places=dict(zip(seen.frame.tolist(), at.tolist(), strict=True)),
+        places=places,
         rows=tuple(row for course in courses for row in _rows(course)),
         words=_counted(seen, course_of("height_mm")) + _without_shape(courses),
         setup_words=marked_setup_words(session.setup_status, session.setup_words),
@@ -136,13 +133,19 @@ def show(
     )
 
 
-def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> TrendsState:
-    """Data of a line pattern over the recording; no choice of measures, no spectrum."""
-    found = line_trend(session)
+def _axis(seen: Overview) -> tuple[bool, Axis, dict[int, float]]:
+    """Whether all frames have times, the axis over them, and the place of each frame on it."""
     timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
     at = seen.time_s if timed else seen.frame.astype(float)
     span = (float(at.min()), float(at.max())) if len(at) else None
-    places = dict(zip(seen.frame.tolist(), at.tolist(), strict=True))
+    axis = Axis("Time", "s", span=span) if timed else Axis("Frame", "", 0, span=span)
+    return timed, axis, dict(zip(seen.frame.tolist(), at.tolist(), strict=True))
+
+
+def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> TrendsState:
+    """Data of a line pattern over the recording; no choice of measures, no spectrum."""
+    found = line_trend(session)
+    timed, axis, places = _axis(seen)
     x = np.array([places[frame] for frame in found.frame.tolist()], float)
     mark = np.where(found.stale, STALE, MEASURED).astype(np.int64)
     none = np.full(len(x), np.nan)
@@ -172,7 +175,7 @@ def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> Tren
         words = _followed(x, found.values["shift_px"], timed)
     return TrendsState(
         curves=tuple(curves),
-        axis=Axis("Time", "s", span=span) if timed else Axis("Frame", "", 0, span=span),
+        axis=axis,
         places=places,
         rows=(),
         words=words,

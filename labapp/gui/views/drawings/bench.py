@@ -14,6 +14,7 @@ from PySide6.QtWidgets import QAbstractSpinBox, QBoxLayout, QGridLayout, QWidget
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
+from labapp.gui.theme import RED
 from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes, show_axes
 from labapp.gui.views.drawings.dimension import DimensionBox
 from labapp.gui.widgets.fields import NumberField
@@ -21,7 +22,7 @@ from labapp.gui.widgets.labels import plain_tip
 from labapp.gui.widgets.layouts import vbox
 from labapp.simulation.positioning import Fate, SideView
 
-RED, BLUE = {True: "#ff6b5e", False: "#c62828"}, {True: "#6cb6ff", False: "#1565c0"}
+BLUE = {True: "#6cb6ff", False: "#1565c0"}
 """Colours by whether the background is dark."""
 
 TORCH_MM, SHOULDER_MM = 14.0, 3.5

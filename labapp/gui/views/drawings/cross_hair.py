@@ -10,6 +10,7 @@ from PySide6.QtCore import QPointF, QRect, Qt
 from PySide6.QtGui import QPalette, QResizeEvent
 
 from labapp.core.calibration.laser_calibration import LaserCalibration
+from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes, show_axes
 from labapp.gui.views.drawings.dimension import DimensionBox
 from labapp.gui.widgets.fields import NumberField
@@ -69,7 +70,7 @@ class CrossHairView(Sketch):
         if self._shown is None:
             return
         found, (l1, l2, l3), fan_deg = self._shown
-        beam = "#ff6b5e" if ground.lightness() < 128 else "#c62828"
+        beam = RED[is_dark(self.palette())]
         solid, edge = (
             pg.mkPen(beam, width=1.6, style=style)
             for style in (Qt.PenStyle.SolidLine, Qt.PenStyle.DashLine)

@@ -18,7 +18,7 @@ REST_MS = 120
 """Time, ms, that a frame stays in view before its dots are detected."""
 
 
-class Looking(QObject):
+class FrameReader(QObject):
     """Reads the frame in view, and detects its dots if the session has none.
 
     One task runs at a time; when it ends, the last request is processed.
@@ -88,20 +88,19 @@ class Looking(QObject):
         return self._task is not None and self._task in self._space.tasks.active
 
     def _look(self) -> None:
-        session, image = self._space.session, self.image
-        if session is None or image is None or self.frame is None or self._busy:
+        session, image, frame = self._space.session, self.image, self.frame
+        if session is None or image is None or frame is None or self._busy:
             return
-        missing = presenter.wanted(session, self.frame)
-        if missing is None:
+        if not presenter.needs_dots(session, frame):
             return
-        frame, dots, lattice = missing
+        by = session.settings.dots, session.settings.lattice
 
         def done(found: DetectedDots) -> None:
             self.found = found
             self.ready.emit()
 
         self._task = self._space.tasks.start(
-            "Looking for dots", lambda _: presenter.detect(image, frame, (dots, lattice)), done
+            "Looking for dots", lambda _: presenter.detect(image, frame, by), done
         )
 
 

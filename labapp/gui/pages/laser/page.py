@@ -18,7 +18,7 @@ from labapp.gui.views.drawings.cross_hair import CrossHairView
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.labels import Message, allow, plain_label, wrapping_label
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import RIGHT
@@ -246,12 +246,11 @@ class LaserPage(Page):
         refused = [f"⚠ {result.why_not}"] if result.why_not else []
         self.words.setText("\n".join(refused or warnings or ["✓ The three lengths agree."]))
         why_not = result.why_not or self.locked
-        self.use_button.setEnabled(not why_not)
         tip = "Put angle and distance into the set-up; undo restores the former ones"
-        self.use_button.setToolTip(plain_tip(why_not or tip))
-        drawn = presenter.drawn(readings, result.found)
-        words = f"{result.why_not}. Drawn is an example" if drawn.is_example else DRAWN_WORDS
-        self.drawing.show_laser(drawn.found, drawn.lengths_mm, drawn.fan_angle_deg, words)
+        allow(self.use_button, tip, why_not)
+        example = f"{result.why_not}. Drawn is an example"
+        words = example if result.found is None else DRAWN_WORDS
+        self.drawing.show_laser(*presenter.drawn(readings, result.found), words)
         self._show_lengths(readings)
 
     def _show_lengths(self, readings: Readings) -> None:
@@ -262,8 +261,11 @@ class LaserPage(Page):
             field.lock(self.locked or (SEVERAL if several else ""))
 
     def _enter_length(self, column: int, value: float | None) -> None:
-        """Write a length entered in the drawing to the table."""
-        self.table.setItem(0, column, _cell("" if value is None else _length(value)))
+        """Write a length entered in the drawing to the row of the reading that it replaces."""
+        rows = range(self.table.rowCount())
+        known = (row for row in rows if presenter.length_mm(self._text(row, column)) is not None)
+        text = "" if value is None else _length(value)
+        self.table.setItem(next(known, 0), column, _cell(text))
 
     # --- the picture ------------------------------------------------------------------------
 

@@ -33,10 +33,11 @@ from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick, ticked
 from labapp.session.session import Session
+from labapp.text import local_time
 
 ENTRIES = {entry.key: entry for _, entries in RIG for entry in entries}
 
-EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB, STEPS_TAB = range(4)
+EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB = range(3)
 
 
 class SetupPage(Page):
@@ -46,9 +47,7 @@ class SetupPage(Page):
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
-        self.drawn_fields = {key: _number(ENTRIES[key]) for key in DRAWN}
-        for key, field in self.drawn_fields.items():
-            self._put_when_edited(field, key)
+        self.drawn_fields = {key: self._put_field(ENTRIES[key]) for key in DRAWN}
         self.bench = BenchView(self.drawn_fields)
         self.canvas_layout.addWidget(self.bench)
         self.rig_fields: dict[str, NumberField] = {}
@@ -110,7 +109,7 @@ class SetupPage(Page):
         times = dict(ticked(shown.record))
         for item, box in (self.ticks | self.steps).items():
             box.setChecked(item in times)
-            self._times[item].setText(f"ticked {_clock(times[item])}" if item in times else "")
+            self._times[item].setText(f"ticked {local_time(times[item])}" if item in times else "")
         self.tabs.setTabText(SAFETY_TAB, f"Safety {len(times.keys() & self.ticks)}/{len(SAFETY)}")
         self.tabs.setTabText(BENCH_TAB, "Bench ⚠" if shown.problems or shown.missing else "Bench")
         show_words(self.others, "\n".join(shown.others))
@@ -133,15 +132,6 @@ class SetupPage(Page):
                 field.label.setVisible(kind in entry.kinds)
                 if sigma is not None:  # its label is not shown
                     self.sigma_fields[sigma.key].setVisible(kind in sigma.kinds)
-
-    def leave(self) -> None:
-        """Finish an edit in progress."""
-        numbers = (
-            *(*self.rig_fields.values(), *self.sigma_fields.values()),
-            *self.drawn_fields.values(),
-        )
-        for field in (*numbers, *self.record_fields.values()):
-            field.flush()
 
     def load(self, path: Path) -> None:
         """Load the setup from a file."""
@@ -173,10 +163,8 @@ class SetupPage(Page):
         else:
             lines = 4 if entry.key == "notes" else 1
             field = TextField(entry.label, tooltip=entry.tooltip, lines=lines)
-        field.edited.connect(
-            lambda value: self.workspace.attempt(
-                lambda session: presenter.note(session, entry.key, value)
-            )
+        self.change_when_edited(
+            field, lambda session, value: presenter.note(session, entry.key, value)
         )
         self.record_fields[entry.key] = field
         form.add(field)
@@ -235,7 +223,9 @@ class SetupPage(Page):
                 self.pattern = PatternView()
                 form.add_wide(self.pattern)
             for entry in entries:
-                form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
+                field = self.rig_fields[entry.key] = self._put_field(entry)
+                sigma = presenter.sigma_entry(entry)
+                form.add(field, None if sigma is None else self._sigma_field(sigma))
             if title == "Torch":
                 tip = "Where the pool's head is: +Y is the laser's side. The rear may lie lower"
                 self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)
@@ -243,9 +233,7 @@ class SetupPage(Page):
         title, entries = UNCERTAIN_ONLY
         form.add_heading(f"{title}, ±")
         for entry in entries:
-            field = self._sigma_field(entry)
-            assert field is not None
-            form.add(field)
+            form.add(self._sigma_field(entry))
         form.add_heading("Expected pool")
         for entry in POOL:
             self._add_noted(form, entry)
@@ -270,27 +258,20 @@ class SetupPage(Page):
         put: Callable[[Session, str], None],
     ) -> ChoiceField:
         field = ChoiceField(label, options, tooltip=tooltip)
-        field.edited.connect(
-            lambda value: self.workspace.attempt(lambda session: put(session, value))
+        self.change_when_edited(field, put)
+        return field
+
+    def _put_field(self, entry: Entry) -> NumberField:
+        """A field that enters its number in the set-up."""
+        field = _number(entry)
+        self.change_when_edited(
+            field, lambda session, value: presenter.put(session, entry.key, value)
         )
         return field
 
-    def _rig_field(self, entry: Entry) -> NumberField:
-        field = self.rig_fields[entry.key] = _number(entry)
-        self._put_when_edited(field, entry.key)
+    def _sigma_field(self, entry: Entry) -> NumberField:
+        field = self.sigma_fields[entry.key] = self._put_field(entry)
         return field
-
-    def _sigma_field(self, entry: Entry | None) -> NumberField | None:
-        if entry is None:
-            return None
-        field = self.sigma_fields[entry.key] = _number(entry)
-        self._put_when_edited(field, entry.key)
-        return field
-
-    def _put_when_edited(self, field: NumberField, key: str) -> None:
-        field.edited.connect(
-            lambda value: self.workspace.attempt(lambda session: presenter.put(session, key, value))
-        )
 
     def _use_defaults(self) -> None:
         if self.workspace.attempt(presenter.put_usual, beside=self.answer.setText):
@@ -323,7 +304,3 @@ def _top(content: QWidget) -> QWidget:
     page = QWidget()
     fill(QVBoxLayout(page), content, 1)
     return page
-
-
-def _clock(iso: str) -> str:
-    return iso.partition("+")[0].replace("T", " ")

@@ -1,6 +1,6 @@
 """The dots page: the frame, its dots and rows, and keys and buttons for their correction.
 
-For a line pattern it shows lines instead (`lines_hand`).
+For a line pattern it shows lines instead (`line_tool`).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from labapp.core.pipeline import Settings
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.lattice import Site
 from labapp.gui.pages.dots import presenter
-from labapp.gui.pages.dots.background import Looking, carry_on
 from labapp.gui.pages.dots.editing import Editor
 from labapp.gui.pages.dots.fitting import Refit
-from labapp.gui.pages.dots.lines import show_lines
-from labapp.gui.pages.dots.lines_hand import LinesHand
-from labapp.gui.pages.dots.lines_view import LinesOverlay
+from labapp.gui.pages.dots.frame_reader import FrameReader, carry_on
+from labapp.gui.pages.dots.line_overlay import LinesOverlay
+from labapp.gui.pages.dots.line_presenter import show_lines
+from labapp.gui.pages.dots.line_tool import LineTool
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel, MeasureLead
 from labapp.gui.pages.dots.presenter import DetectorNumber, DotsState, Figures, Need
@@ -64,8 +64,8 @@ class DotsPage(Page):
         self.view = PictureView("Frame with its dots")
         self.overlay = DotsOverlay(self.view)
         self.lines = LinesOverlay(self.view)
-        self.view.tool = self.hand = Hand(self)
-        self.looking = Looking(workspace)
+        self.view.tool = self.dot_tool = DotTool(self)
+        self.reader = FrameReader(workspace)
         self.refit = Refit(workspace)
         self.seen: DotsState | None = None
         self._before: tuple[int, Figures | None] | None = None
@@ -74,17 +74,18 @@ class DotsPage(Page):
         self._lines_frame = -1
         self._in_view = False
         self._unmet: dict[str, str] = {}
-        self._needs = {c.text: c.needs for c in (*self._edits(), *self._frame_commands())}
+        needing = (*self._edits(), *self._frame_commands(), *(c for c in self._keys() if c.needs))
+        self._needs = {command.text: command.needs for command in needing}
         edits, frames, keys = (
-            [self.action(*command[:4]) for command in commands]
+            [self.action(c.text, c.key, c.tip, partial(self._run, c)) for c in commands]
             for commands in (self._edits(), self._frame_commands(), self._keys())
         )
         self._dot_actions = [*edits, *frames, *keys]
         self.view.menu_actions = self._menu_actions = [*edits, *frames]
-        self.lines_hand = LinesHand(self, self.lines, self.action, lambda: self.pointer)
+        self.line_tool = LineTool(self, self.lines, self.action, lambda: self.pointer)
         self.dots_panel = DotsPanel(edits, frames)
         self.canvas_layout.addWidget(self.view)
-        self.lines_panel = self.lines_hand.panel
+        self.lines_panel = self.line_tool.panel
         self.lines_panel.hide()
         self.measure_lead = MeasureLead(workspace.action_requested.emit)
         fill(
@@ -115,7 +116,7 @@ class DotsPage(Page):
             field.edited.connect(partial(self._set_number, number))
         self.view.pointed.connect(self._point)
         self.view.canvas.installEventFilter(self)
-        self.looking.ready.connect(self._again)
+        self.reader.ready.connect(self._again)
         # The window may show a change with a delay; the next edit must start from it.
         self.workspace.changed.connect(self._again)
         self.workspace.tasks.changed.connect(self._show_lead)
@@ -131,24 +132,24 @@ class DotsPage(Page):
         if not len(session.frames):
             self.view.show_picture(None, "Import a recording first")
             return
-        if self.looking.frame != frame:
-            self.looking.read(frame)
+        if self.reader.frame != frame:
+            self.reader.read(frame)
             return  # the previous frame with its dots stays until this one is read
         same = self.seen is not None and self.seen.frame == frame
-        if self.looking.image is None or self.view.picture is not self.looking.image:
-            self.view.show_picture(self.looking.image, self.looking.why)
+        if self.reader.image is None or self.view.picture is not self.reader.image:
+            self.view.show_picture(self.reader.image, self.reader.why)
         self._show_pattern(session.has_lines)
         if session.has_lines:
             state = show_lines(session, frame)
             self.lines_panel.show_frame(state)
             self._show_lead()
-            self.lines_hand.show(state, self._lines_frame == frame)
+            self.line_tool.show(state, self._lines_frame == frame)
             self._lines_frame = frame
             self.refit.want(frame, state.due)
             return
-        self.seen = presenter.shown(session, frame, self.looking.found)
+        self.seen = presenter.shown(session, frame, self.reader.found)
         if self.seen.correction is None:
-            self.looking.look()
+            self.reader.look()
         self.refit.want(frame, presenter.needs_fit(self.seen))
         self.editor.show(self.seen.correction, same)
         correction = self.seen.correction
@@ -165,10 +166,10 @@ class DotsPage(Page):
         self.dots_panel.setVisible(not lines)
         for action in self._dot_actions:
             action.setEnabled(not lines)
-        for action in self.lines_hand.actions:
+        for action in self.line_tool.actions:
             action.setEnabled(lines)
-        self.view.tool = self.lines_hand if lines else self.hand
-        self.view.menu_actions = self.lines_hand.actions if lines else self._menu_actions
+        self.view.tool = self.line_tool if lines else self.dot_tool
+        self.view.menu_actions = self.line_tool.actions if lines else self._menu_actions
         if lines:
             self.seen = None
             self.editor.show(None, same_frame=False)
@@ -221,7 +222,7 @@ class DotsPage(Page):
         elif len(editor.rows) == 1:
             site = editor.rows[0], 0
         chosen = presenter.chosen_words(editor.correction, editor.selection.tolist())
-        words = self.hand.asked or chosen
+        words = self.dot_tool.asked or chosen
         is_new = words != self.dots_panel.chosen.text()
         self.dots_panel.show_chosen(words, editor.rows, site)
         if is_new and editor.selection.size and self.view.hasFocus():
@@ -250,9 +251,9 @@ class DotsPage(Page):
     def leave(self) -> None:
         """End a drag or nudge in progress; a running fit continues."""
         self._in_view = False
-        self.hand.release()
-        self.hand.give_up()  # a pending click must not affect another session
-        self.looking.stop()
+        self.dot_tool.release()
+        self.dot_tool.give_up()  # a pending click must not affect another session
+        self.reader.stop()
 
     def picture(self) -> QPixmap:
         """Picture of the frame with its marks."""
@@ -321,7 +322,7 @@ class DotsPage(Page):
 
     def add_at(self, u: float, v: float) -> None:
         """Add the dot at a position."""
-        image, session = self.looking.image, self.workspace.session
+        image, session = self.reader.image, self.workspace.session
         if image is not None and session is not None:
             self.editor.add(image, u, v, session.settings)
             self.draw()
@@ -331,36 +332,24 @@ class DotsPage(Page):
         if self.pointer is not None:
             do(*self.pointer)
         else:
-            self.hand.ask(do, f"{ask} (Esc: leave it)")
+            self.dot_tool.ask(do, f"{ask} (Esc: leave it)")
             self.view.setFocus()
             self.draw()
 
     def _carry_on(self) -> None:
-        seen = self.seen
-        if seen is None or seen.correction is None:
-            self.workspace.notified.emit("There are no dots yet to carry on", True)
-            return
+        assert self.seen is not None
         most = self.dots_panel.most.value()
-        carry_on(self, seen, None if most is None else int(most), self.dots_panel.carried)
-
-    def _automatic(self) -> None:
-        if self.seen is not None and self.seen.origin != "corrected":
-            self.workspace.notified.emit(presenter.UNMET["corrected"], False)
-        else:
-            self.editor.back_to_automatic()
+        carry_on(self, self.seen, None if most is None else int(most), self.dots_panel.carried)
 
     def _escape(self) -> None:
-        if self.hand.busy:
-            self.hand.give_up()
+        if self.dot_tool.busy:
+            self.dot_tool.give_up()
         else:
             self.editor.choose_none()
         self.draw()
 
     def _type_row(self) -> None:
-        if why := self._unmet.get("Delete", ""):  # which has the same need
-            self.workspace.notified.emit(why, True)
-        else:
-            self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
+        self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
 
     # --- keys and buttons ---------------------------------------------------------------------
 
@@ -377,6 +366,13 @@ class DotsPage(Page):
         for widget in (self, self.panel):
             widget.addAction(action)
         return action
+
+    def _run(self, command: Command) -> None:
+        """Run a command, or report what it needs."""
+        if why := self._unmet.get(command.text, ""):
+            self.workspace.notified.emit(why, True)
+        else:
+            command.do()
 
     def _edits(self) -> tuple[Command, ...]:
         editor = self.editor
@@ -419,7 +415,7 @@ class DotsPage(Page):
             Command("Carry on", "Ctrl+Return", "Apply these dots and rows to the following frames "
                     "by tracking, until they no longer fit", self._carry_on, "rows"),
             Command("Back to automatic", "Ctrl+Backspace", "Discard the corrections of this frame",
-                    self._automatic, "corrected"),
+                    self.editor.back_to_automatic, "corrected"),
         )  # fmt: skip
 
     def _keys(self) -> tuple[Command, ...]:
@@ -436,7 +432,7 @@ class DotsPage(Page):
                     lambda: self.choose(editor.choose_next, -1)),
             Command("Whole row", "W", "Select all dots in the rows of the selected ones",
                     lambda: self.choose(editor.choose_rows, editor.rows)),
-            Command("Type a row", "T", "Type the row of the selected dots", self._type_row),
+            Command("Type a row", "T", "Type the row of the selected dots", self._type_row, "dots"),
             Command("Hide marks", "H", "Hide the marks, or show them again",
                     self.overlay.toggle),
         )  # fmt: skip
@@ -446,7 +442,7 @@ class DotsPage(Page):
         self.draw()
 
 
-class Hand(Tool):
+class DotTool(Tool):
     """Tool for selecting and moving dots with the pointer and the arrow keys."""
 
     def __init__(self, page: DotsPage) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from PySide6.QtCore import QSize, Qt, QTimer
 from PySide6.QtGui import (
     QAction,
-    QGuiApplication,
     QHideEvent,
     QKeySequence,
     QPalette,
@@ -52,7 +51,7 @@ from labapp.gui.views.picture_files import RASTERS, ask_paper, with_suffix, writ
 from labapp.gui.views.steering import Steering
 from labapp.gui.views.view3d import LOOKS, View3d, as_image
 from labapp.gui.views.view3d_kinds import make_view3d
-from labapp.gui.widgets.buttons import tool_button
+from labapp.gui.widgets.buttons import add_action, tool_button
 from labapp.gui.widgets.fields import ChoiceField, NumberField
 from labapp.gui.widgets.labels import Message
 from labapp.gui.widgets.layouts import fill, hbox, vbox
@@ -246,22 +245,18 @@ class SurfacePage(Page):
             ("True scale, or exaggerated", "E", self.toggle_scale),
             ("Contour lines", "C", lambda: self._set(contours=not self.options.contours)),
         ):
-            action = QAction(words, self.view)
-            action.setShortcut(QKeySequence(key))
-            action.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
-            action.triggered.connect(lambda *_, do=work: do())
-            self.view.addAction(action)
+            add_action(self.view, words, work, key)
 
     def _parts_button(self) -> QToolButton:
         menu = QMenu(self)
         menu.setToolTipsVisible(True)
-        self.parts: dict[str, QAction] = {}
+        self.drawn_items: dict[str, QAction] = {}
         for name, (words, what) in SHOWN_PARTS.items():
             action = menu.addAction(words)
             action.setCheckable(True)
             action.setToolTip(what)
             action.toggled.connect(lambda ticked, name=name: self._set(**{name: ticked}))
-            self.parts[name] = action
+            self.drawn_items[name] = action
         button = tool_button("Show", "Choose what the 3-D view shows", lambda: None)
         button.setMenu(menu)
         button.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
@@ -292,11 +287,6 @@ class SurfacePage(Page):
         """The 3-D picture, or the whole comparison."""
         image = None if self.stack.currentWidget() is self.compare else self.view.image()
         return self.grab() if image is None else QPixmap.fromImage(image)
-
-    def copy_picture(self) -> None:
-        """Copy the picture to the clipboard."""
-        QGuiApplication.clipboard().setPixmap(self.picture())
-        self.confirm("The picture is on the clipboard", self.saved)
 
     def save_picture(self) -> None:
         """Ask for a file and write the picture to it."""
@@ -391,7 +381,7 @@ class SurfacePage(Page):
         self._exaggerated = high if high != 1.0 else self._exaggerated
         self.high.set_value(high)
         self.true_scale.setChecked(high == 1.0)
-        for name, action in self.parts.items():
+        for name, action in self.drawn_items.items():
             action.blockSignals(True)
             action.setChecked(getattr(self.options, name))
             action.blockSignals(False)

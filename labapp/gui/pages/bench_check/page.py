@@ -18,16 +18,16 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.bench_check import presenter
-from labapp.gui.pages.bench_check.chosen import Chosen, kept_pictures
+from labapp.gui.pages.bench_check.listed_picture import ListedPicture, kept_pictures
 from labapp.gui.pages.bench_check.mirror_form import MirrorForm
-from labapp.gui.pages.bench_check.presenter import COLUMNS, Checked, Predicted
+from labapp.gui.pages.bench_check.presenter import COLUMNS, CheckResult, Predicted
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import Lead, Mark, Offer, State, setup_to_do
 from labapp.gui.tasks import Control
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField
-from labapp.gui.widgets.labels import Message, heading, plain_tip, show_words, wrapping_label
+from labapp.gui.widgets.labels import Message, allow, heading, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.tables import FullTable, ReadTable
 from labapp.gui.workspace import Workspace
@@ -52,8 +52,8 @@ class BenchCheckPage(Page):
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
-        self.chosen: list[Chosen] = []
-        self.checked: Checked | None = None
+        self.chosen: list[ListedPicture] = []
+        self.checked: CheckResult | None = None
         self.answer = Message(4)
         self._path: Path | None = None
         self._kept: BenchCheckRecord | None = None
@@ -65,7 +65,7 @@ class BenchCheckPage(Page):
         self.quantities = _QuantityTable()
         left, self.found = QWidget(), QWidget()
         vbox((self.view, 1), self.legend, self.pointed, of=left)
-        vbox((self.quantities, 1), wrapping_label(presenter.KEY), of=self.found)
+        vbox((self.quantities, 1), wrapping_label(presenter.LEGEND), of=self.found)
         self.splitter = QSplitter(Qt.Orientation.Horizontal)
         self.splitter.setChildrenCollapsible(False)
         self.splitter.addWidget(left)
@@ -131,7 +131,7 @@ class BenchCheckPage(Page):
     def _take_kept(self) -> None:
         session, kept = self.session, self._kept
 
-        def shown(chosen: Sequence[Chosen]) -> None:
+        def shown(chosen: Sequence[ListedPicture]) -> None:
             if session.bench_check is kept:
                 self._list(chosen)
 
@@ -143,12 +143,12 @@ class BenchCheckPage(Page):
     def load(self, *paths: Path) -> None:
         """Add pictures, initially of a plate."""
 
-        def loaded(pictures: Sequence[Chosen]) -> None:
+        def loaded(pictures: Sequence[ListedPicture]) -> None:
             self._list([*self.chosen, *pictures], len(self.chosen))
 
         self.start_task(
             "Loading the picture",
-            lambda _: [Chosen(path.name, read_picture(path)) for path in paths],
+            lambda _: [ListedPicture(path.name, read_picture(path)) for path in paths],
             loaded,
         )
 
@@ -166,7 +166,7 @@ class BenchCheckPage(Page):
             at = self._at()
             self._list([one for k, one in enumerate(self.chosen) if k != at], max(0, at - 1))
 
-    def change(self, one: Chosen) -> None:
+    def change(self, one: ListedPicture) -> None:
         """Change the mirror of the selected picture."""
         at = self._at()
         self._list([one if k == at else other for k, other in enumerate(self.chosen)], at)
@@ -174,17 +174,15 @@ class BenchCheckPage(Page):
     def _at(self) -> int:
         return max(0, min(self.list.currentRow(), len(self.chosen) - 1))
 
-    def _list(self, chosen: Sequence[Chosen], at: int = 0) -> None:
+    def _list(self, chosen: Sequence[ListedPicture], at: int = 0) -> None:
         """Show a list of pictures; results of another list are discarded."""
         self.chosen = list(chosen)
         dropped = self.checked is not None and self.checked.chosen != tuple(chosen)
         if dropped:
             self.checked = None
             self.answer.setText("")
-        self.list.setRowCount(len(chosen))
-        for row, one in enumerate(chosen):
-            for column, text in enumerate((f"{row + 1}  {one.name}", one.mirror_words)):
-                self.list.set_cell(row, column, text, number=False)
+        texts = [(f"{n}  {one.name}", one.mirror_words) for n, one in enumerate(chosen, 1)]
+        self.list.show_texts(texts, words=(0, 1))
         if chosen:
             self.list.selectRow(min(at, len(chosen) - 1))
         if dropped:
@@ -201,11 +199,11 @@ class BenchCheckPage(Page):
         text, path, settings = session.setup_text, session.path, session.settings.dots
         pool = presenter.expected_cap(session.record)
 
-        def work(control: Control) -> Checked:
+        def work(control: Control) -> CheckResult:
             presenter.check_sizes(session, chosen)
             return presenter.check(chosen, (text, path), settings, control.progress, free, pool)
 
-        def found(made: Checked) -> None:
+        def found(made: CheckResult) -> None:
             if tuple(self.chosen) == chosen:
                 self.checked = made
                 self.workspace.changed.emit()
@@ -246,10 +244,6 @@ class BenchCheckPage(Page):
         self.predicted.show_texts(() if made is None else made.rows)
         self.predicted.setVisible(made is not None)
 
-    def leave(self) -> None:
-        """Finish an edit in progress."""
-        self.mirror_form.flush()
-
     # --- the panel ----------------------------------------------------------------------------
 
     def _make_panel(self) -> None:
@@ -258,20 +252,17 @@ class BenchCheckPage(Page):
         self.predicted = FullTable(
             name, f"{name}: Ctrl+C copies it", ("After a check with", "±, mm")
         )
-        self.predicted.offer(("Copy table", self.predicted.copy_text))
         self.predicted_words = wrapping_label()
         tip = "Add pictures of a mirror's dots, taken by the camera in its place"
         self.add_button = button("Add picture…", tip, self._choose)
         self.remove_button = button("Remove", "Remove the picture from the list", self.remove)
-        self.list = ReadTable("Pictures of mirrors", "Pictures and the mirrors that they show")
-        self.list.setColumnCount(2)
-        self.list.setHorizontalHeaderLabels(["Picture", "Mirror"])
+        tip = "Pictures and the mirrors that they show"
+        self.list = ReadTable("Pictures of mirrors", tip, ("Picture", "Mirror"))
         self.list.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
         self.list.horizontalHeader().setSectionResizeMode(1, QHeaderView.ResizeMode.Stretch)
         self.list.itemSelectionChanged.connect(self._follow)
         self.list.verticalHeader().setDefaultSectionSize(ROW_PX)
         self.list.setFixedHeight(ROW_PX * (LIST_ROWS + 1) + 8)
-        self.list.offer(("Copy table", self.list.copy_text))
         self.mirror_form = MirrorForm(self._selected, self.change)
         self.kind, self.diameter = self.mirror_form.kind, self.mirror_form.diameter
         self.height_field = self.mirror_form.height_field
@@ -285,7 +276,6 @@ class BenchCheckPage(Page):
             "Ctrl+C copies the table"
         )
         self.mirrors = FullTable("Known mirrors, measured", tip, presenter.MIRROR_COLUMNS)
-        self.mirrors.offer(("Copy table", self.mirrors.copy_text))
         fill(
             self.panel_layout,
             *(self.predict_button, self.predicted_words, self.predicted),
@@ -310,7 +300,7 @@ class BenchCheckPage(Page):
         if path := ask_file(self, "Picture of a mirror", self.workspace.folder):
             self.load(path)
 
-    def _selected(self) -> Chosen:
+    def _selected(self) -> ListedPicture:
         return self.chosen[self._at()]
 
     # --- what is shown ------------------------------------------------------------------------
@@ -358,7 +348,7 @@ class BenchCheckPage(Page):
         wrong = next((one.problem for one in self.chosen if one.problem), "")
         why_not = lacking or wrong or ("" if self.chosen else "Add a picture of a mirror first")
         tip = "Find the dots' rays and adjust the set-up to the known mirrors"
-        self._let(self.check_button, why_not, tip)
+        allow(self.check_button, tip, why_not)
         made = self.checked
         if used:
             unusable = "It is in use"
@@ -367,19 +357,11 @@ class BenchCheckPage(Page):
         else:
             unusable = "" if made.usable else "What is wrong must be corrected first"
         tip = "Measure with the adjusted set-up; undo restores the former one"
-        self._let(self.use_button, self.locked or unusable, tip)
+        allow(self.use_button, tip, self.locked or unusable)
         tip = "Predicted ± of the height of the expected pool, after each set of pictures"
-        self._let(self.predict_button, lacking, tip)
-        self._let(
-            self.remove_button,
-            self.locked or ("" if self.chosen else "No picture"),
-            "Remove it from the list",
-        )
-
-    @staticmethod
-    def _let(pressed: QWidget, why_not: str, tip: str) -> None:
-        pressed.setEnabled(not why_not)
-        pressed.setToolTip(plain_tip(why_not or tip))
+        allow(self.predict_button, tip, lacking)
+        why_not = self.locked or ("" if self.chosen else "No picture")
+        allow(self.remove_button, "Remove it from the list", why_not)
 
     def _show_picture(self, found: MirrorPicture | None) -> None:
         image = self._selected().image if self.chosen else None
@@ -429,7 +411,6 @@ class _QuantityTable(ReadTable):
         self._narrowed = QTimer(self, singleShot=True, interval=0)
         self._narrowed.timeout.connect(self._fit_names)
         self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
-        self.offer(("Copy table", self.copy_text))
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Use the remaining width for the names, but at least the width for two lines."""
@@ -453,7 +434,7 @@ class _QuantityTable(ReadTable):
             at = self.rowCount()
             self.setRowCount(at + 1)
             for column, text in enumerate(row.texts):
-                tip = presenter.KEY if column == len(row.texts) - 1 else ""
+                tip = presenter.LEGEND if column == len(row.texts) - 1 else ""
                 self.set_cell(at, column, text, number=column in (1, 2), tip=tip)
         self.resizeRowsToContents()
 

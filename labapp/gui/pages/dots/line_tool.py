@@ -16,8 +16,8 @@ from labapp.core.lines.correction import (
     number_line,
 )
 from labapp.gui.pages.dots import presenter
-from labapp.gui.pages.dots.lines import LinesState
-from labapp.gui.pages.dots.lines_view import LinesOverlay, LinesPanel
+from labapp.gui.pages.dots.line_overlay import LinesOverlay, LinesPanel
+from labapp.gui.pages.dots.line_presenter import LinesState
 from labapp.gui.pages.page import Page
 from labapp.gui.views.drag_point import SHIFT
 from labapp.gui.views.picture import Tool
@@ -38,7 +38,7 @@ UNMET = {
 }
 
 
-class LinesHand(Tool):
+class LineTool(Tool):
     """Selection of lines by clicks, and their correction.
 
     Parameters

@@ -23,7 +23,7 @@ from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, plain_label, plain_tip, show_words, wrapping_label
+from labapp.gui.widgets.labels import Message, allow, plain_label, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
@@ -155,10 +155,6 @@ class PlanePage(Page):
         load = Offer("&Load picture…", "Of the target, or of a board", self._choose)
         tip = "The target that is chosen at the right"
         return Lead(NO_PICTURE, (load, Offer("&Save for printing…", tip, self._choose_target)))
-
-    def leave(self) -> None:
-        """Finish an edit in progress."""
-        self.unit.flush()
 
     # --- the panel --------------------------------------------------------------------------
 
@@ -382,9 +378,8 @@ class PlanePage(Page):
         parts = (f"⚠ {words}" for words in (*why_not, *result.warnings))
         show_words(self.words, "\n".join(parts))
         unusable = result.why_not or self.locked
-        self.use_button.setEnabled(not unusable)
         tip = "Measure with this calibration; undo restores the former one"
-        self.use_button.setToolTip(plain_tip(unusable or tip))
+        allow(self.use_button, tip, unusable)
         self.find_button.setEnabled(self.view.picture is not None and not self.locked)
         for point in self.points:
             point.movable = not self.locked

@@ -22,7 +22,7 @@ USUAL: Mapping[str, tuple[float, float | None]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen:
+class ListedPicture:
     """A picture in the list."""
 
     name: str
@@ -77,13 +77,13 @@ class Chosen:
             return "A cap is higher than 0 mm"
         return ""
 
-    def of_kind(self, kind: str) -> Chosen:
+    def of_kind(self, kind: str) -> ListedPicture:
         """The same picture with the usual mirror of another kind."""
         height, diameter = USUAL[kind]
-        return Chosen(self.name, self.image, kind, height, diameter)
+        return ListedPicture(self.name, self.image, kind, height, diameter)
 
     @classmethod
-    def of_kept(cls, one: MirrorPicture, image: GreyImage) -> Chosen:
+    def of_kept(cls, one: MirrorPicture, image: GreyImage) -> ListedPicture:
         """A picture of a stored check."""
         made = cls(one.name, image, one.kind, one.height_mm, one.diameter_mm)
         usual = dict(zip(made.mirror.parameters, made.mirror.sigma.tolist(), strict=True))
@@ -93,7 +93,7 @@ class Chosen:
 
     def is_of(self, one: MirrorPicture) -> bool:
         """Whether a stored check has this picture with this mirror."""
-        return Chosen.of_kept(one, self.image)._key == self._key
+        return ListedPicture.of_kept(one, self.image)._key == self._key
 
     @property
     def _key(self) -> tuple[object, ...]:
@@ -101,10 +101,10 @@ class Chosen:
         return self.name, self.kind, *sizes
 
 
-def kept_pictures(session: Session) -> tuple[Chosen, ...]:
+def kept_pictures(session: Session) -> tuple[ListedPicture, ...]:
     """Pictures of the check stored in the session."""
     found = session.bench_check
     return tuple(
-        Chosen.of_kept(one, session.picture(one.picture_sha256))
+        ListedPicture.of_kept(one, session.picture(one.picture_sha256))
         for one in (found.pictures if found else ())
     )

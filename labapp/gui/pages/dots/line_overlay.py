@@ -15,7 +15,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QHeaderView, QToolButton, QWidget
 
-from labapp.gui.pages.dots.lines import COLUMNS, DrawnLine, LinesState
+from labapp.gui.pages.dots.line_presenter import COLUMNS, DrawnLine, LinesState
 from labapp.gui.pages.dots.overlay import cosmetic_pen, row_color
 from labapp.gui.pages.dots.panel import button_grid
 from labapp.gui.views.picture import PictureView
@@ -130,10 +130,7 @@ class LineList(ReadTable):
 
     def show_lines(self, listed: tuple[tuple[str, ...], ...]) -> None:
         """Show the rows of the lines."""
-        self.setRowCount(len(listed))
-        for k, cells in enumerate(listed):
-            for column, text in enumerate(cells):
-                self.set_cell(k, column, text, number=column < len(cells) - 1, tip=text)
+        self.show_texts(listed, words=(len(COLUMNS) - 1,))
         self.setFixedHeight(self.full_height)
 
     @property
