@@ -10,10 +10,12 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
+from labapp.errors import InputError
 from labapp.gui.pages.trends import TrendsPage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import dynamics_shown
 from labapp.gui.tools.dynamics import DynamicsWindow
+from labapp.session.session import Session
 from tests.conftest import Run
 from tests.core.dynamics_truth import analysed_step
 from tests.gui.conftest import CopySample
@@ -115,6 +117,26 @@ def test_missing_frame_rate_prevents_the_analysis(
     tool = opened(window, copy_sample("concave"))
     assert not tool.working
     assert "frame rate" in tool.words.text()
+    assert not tool.start_button.isEnabled()
+
+
+def test_damaged_session_is_reported(
+    tool: DynamicsWindow, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(self: Session, scheme: str | None = None) -> None:
+        raise InputError(self.path, "table of results", "damaged", "what was written")
+
+    messages: list[tuple[str, bool]] = []
+    window.workspace.notified.connect(lambda words, problem: messages.append((words, problem)))
+    monkeypatch.setattr(Session, "overview", damaged)
+    window.workspace._forget()
+    for act in (tool.show_state, tool.prefill, tool.start):
+        messages.clear()
+        act()
+        assert messages
+        assert all("table of results: damaged" in words for words, _ in messages)
+        assert all(problem for _, problem in messages)
+    assert not tool.working
     assert not tool.start_button.isEnabled()
 
 

@@ -126,14 +126,18 @@ class DynamicsWindow(ToolWindow):
 
     def prefill(self) -> None:
         """Analyse the session's results unless they are already shown."""
-        if not shown.same_results(self.workspace.overview(), self._of):
+        if not shown.same_results(self._overview(), self._of):
             self.start()
+
+    def _overview(self) -> Overview | None:
+        """Overview of the session; None without a session, and if it is damaged: reported."""
+        return self.workspace.run_or_report(self.workspace.overview)
 
     def start(self) -> None:
         """Analyse the session's results in the background."""
         for field in (self.segment, *self.band):
             field.flush()
-        session, seen = self.workspace.session, self.workspace.overview()
+        session, seen = self.workspace.session, self._overview()
         why = shown.impossible(session, seen)
         if why or session is None or seen is None or self.working:
             self.show_state()
@@ -281,7 +285,7 @@ class DynamicsWindow(ToolWindow):
         if not hasattr(self, "start_button"):
             return
         session = self.workspace.session
-        seen = self.workspace.overview() if session is not None else None
+        seen = self._overview()
         why = shown.impossible(session, seen)
         text = why or (shown.range_text(seen) if seen is not None else "")
         if self.drawn is not None and not shown.same_results(seen, self._of):

@@ -56,8 +56,10 @@ NO_STEPS = (
 
 def impossible(session: Session | None, seen: Overview | None) -> str:
     """Reason why a session's dynamics cannot be determined; empty if they can."""
-    if session is None or seen is None:
+    if session is None:
         return "No session is open."
+    if seen is None:
+        return "The results of the session cannot be read."
     if session.has_lines:
         return "The session is of a line pattern, which has no surface to analyse over time."
     if not np.isfinite(seen.time_s).all():
