@@ -9,6 +9,7 @@ import numpy as np
 
 from labapp.core.values import BoolArray, IntArray
 from labapp.gui.widgets.scrubber import Tick
+from labapp.session.results.statuses import PULSE, is_failed, is_measured
 
 if TYPE_CHECKING:
     from labapp.session.results.measured import Overview
@@ -60,12 +61,14 @@ def standings(seen: Overview) -> IntArray:
     from labapp.session.results.trends import doubtful_frames
 
     status = np.array(seen.status, dtype=object)
-    measured, fine = status != "", np.isin(status, ("ok", "followed"))
-    found = np.where(measured, FrameStatus.MEASURED, FrameStatus.NOT_MEASURED)
-    found = np.where(seen.corrected & (fine | ~measured), FrameStatus.CORRECTED, found)
-    found = np.where(measured & ~fine, FrameStatus.NOT_MEASURABLE, found)
-    found = np.where(status == "pulse", FrameStatus.PULSE, found)
-    doubtful = (measured & seen.stale) | (fine & doubtful_frames(seen))
+    done = status != ""
+    measured = np.array([is_measured(each) for each in seen.status], bool)
+    failed = np.array([is_failed(each) for each in seen.status], bool)
+    found = np.where(done, FrameStatus.MEASURED, FrameStatus.NOT_MEASURED)
+    found = np.where(seen.corrected & (measured | ~done), FrameStatus.CORRECTED, found)
+    found = np.where(failed, FrameStatus.NOT_MEASURABLE, found)
+    found = np.where(status == PULSE, FrameStatus.PULSE, found)
+    doubtful = (done & seen.stale) | (measured & doubtful_frames(seen))
     return np.asarray(np.where(doubtful, FrameStatus.DOUBTFUL, found), np.int64)
 
 
