@@ -25,38 +25,25 @@ class FrameStatus(IntEnum):
     DOUBTFUL = 4
     NOT_MEASURABLE = 5
 
-    @property
-    def words(self) -> str:
-        """Text for the operator."""
-        return WORDS[self]
-
-
-WORDS = {
-    FrameStatus.NOT_MEASURED: "not measured",
-    FrameStatus.PULSE: "dimmer than a current pulse",
-    FrameStatus.MEASURED: "measured",
-    FrameStatus.CORRECTED: "corrected by hand",
-    FrameStatus.DOUBTFUL: "in doubt: stands out, or changed since it was measured",
-    FrameStatus.NOT_MEASURABLE: "could not be measured",
-}
 
 TICKS = (
-    Tick(FrameStatus.NOT_MEASURED.words, "to do", "", "", ((0.0, 0.12),)),
-    Tick(FrameStatus.PULSE.words, "pulse", "#7a4fb5", "#b08ae6", ((0.0, 0.3),)),
-    Tick(FrameStatus.MEASURED.words, "done", "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
-    Tick(FrameStatus.CORRECTED.words, "by hand", "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
-    Tick(FrameStatus.DOUBTFUL.words, "doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
+    Tick("not measured", "to do", "", "", ((0.0, 0.12),)),
+    Tick("dimmer than a current pulse", "pulse", "#7a4fb5", "#b08ae6", ((0.0, 0.3),)),
+    Tick("measured", "done", "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
+    Tick("corrected by hand", "by hand", "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
     Tick(
-        FrameStatus.NOT_MEASURABLE.words, "failed", "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))
+        "in doubt: stands out, or changed since it was measured",
+        *("doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
     ),
+    Tick("could not be measured", "failed", "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))),
 )
-"""Texts by `FrameStatus`."""
+"""Ticks by `FrameStatus`, with the texts for the operator."""
 
-DOUBTFUL = (FrameStatus.DOUBTFUL, FrameStatus.NOT_MEASURABLE)
+TO_CHECK = (FrameStatus.DOUBTFUL, FrameStatus.NOT_MEASURABLE)
 """States that the operator has to check."""
 
 
-def standings(seen: Overview) -> IntArray:
+def frame_statuses(seen: Overview) -> IntArray:
     """State of every frame, values of `FrameStatus`, shape (n,)."""
     from labapp.session.results.trends import doubtful_frames
 
