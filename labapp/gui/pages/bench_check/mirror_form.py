@@ -69,8 +69,7 @@ class MirrorForm(FieldForm):
             "uncertainty; empty: the usual one, in grey. It limits what a check can do",
         )
         self.level.edited.connect(lambda value: change(replace(selected(), level_sigma_deg=value)))
-        for field in self.fields:
-            self.add(field)
+        self.add(*self.fields)
 
     @property
     def fields(self) -> tuple[ChoiceField | NumberField, ...]:

@@ -235,7 +235,8 @@ class SetupPage(Page):
                 self.pattern = PatternView()
                 form.add_wide(self.pattern)
             for entry in entries:
-                form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
+                sigma = self._sigma_field(presenter.sigma_entry(entry))
+                form.add(self._rig_field(entry), beside=sigma)
             if title == "Torch":
                 tip = "Where the pool's head is: +Y is the laser's side. The rear may lie lower"
                 self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)
