@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnDynamics:
     """An analysis with its pictures (PNG)."""
 
     found: Dynamics
@@ -187,14 +187,14 @@ def series_label(name: str) -> str:
 # --- pictures ---------------------------------------------------------------------------------
 
 
-def draw(found: Dynamics, check: Callable[[], None]) -> Drawn:
+def draw(found: Dynamics, check: Callable[[], None]) -> DrawnDynamics:
     """Draw an analysis; ``check`` is called in between and may raise to stop."""
     modes = []
     for one in found.all_modes:
         check()
         modes.append(mode_picture(found, one))
     check()
-    return Drawn(found, spectrum_picture(found), series_picture(found), tuple(modes))
+    return DrawnDynamics(found, spectrum_picture(found), series_picture(found), tuple(modes))
 
 
 def spectrum_picture(found: Dynamics) -> bytes:
