@@ -27,7 +27,8 @@ def _none() -> IntArray:
     return np.zeros(0, np.int64)
 
 
-def _titled(name: str, unit: str) -> str:
+def titled(name: str, unit: str) -> str:
+    """Name of a quantity, and its unit if it has one."""
     return f"{name} ({unit})" if unit else name
 
 
@@ -68,7 +69,7 @@ class Curve(ReadOnlyArrays):
     @property
     def title(self) -> str:
         """Name and unit."""
-        return _titled(self.name, self.unit)
+        return titled(self.name, self.unit)
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Axis:
     @property
     def title(self) -> str:
         """Name and unit."""
-        return _titled(self.name, self.unit)
+        return titled(self.name, self.unit)
 
 
 def point_text(curve: Curve, index: int, axis: Axis) -> str:
@@ -135,7 +136,7 @@ def as_table(curves: Sequence[Curve], axis: Axis) -> str:
         names.append(curve.title)
         columns.append(_cells(keys, curve.key, _numbers(curve.y)))
         if np.isfinite(curve.sigma).any():
-            names.append(_titled(f"{curve.name} σ", curve.unit))
+            names.append(titled(f"{curve.name} σ", curve.unit))
             columns.append(_cells(keys, curve.key, _numbers(curve.sigma)))
     if keyed:
         names.append("mark")
