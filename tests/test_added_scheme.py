@@ -68,7 +68,7 @@ from PySide6.QtWidgets import QApplication, QVBoxLayout, QWidget
 app = QApplication([])
 from labapp.gui.pages.export import presenter as export
 from labapp.gui.pages.surface import compare, comparison, panel, presenter
-from labapp.gui.tools import analysing
+from labapp.gui.tools import analysis_presenter
 from labapp.gui.widgets.labels import Message
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
@@ -86,7 +86,7 @@ box = compare._SchemeBox("First")
 found = {
     "surface page": offered(side.scheme),
     "comparison": offered(box.choice),
-    "error analysis, window": dict(analysing.SCHEME_CHOICES),
+    "error analysis, window": dict(analysis_presenter.SCHEME_CHOICES),
     "error analysis": dict.fromkeys(analysis.AnalysisOptions().schemes),
     "survey": dict.fromkeys(error_analysis.survey.__defaults__[0]),
     "pictures": pictures.STYLE_OF,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ from tests.conftest import Run
 from tests.line_truth.frames import LineLook, render_lines
 from tests.setups import FIVE_LINES as SETUP
 
+SAMPLES = Path(__file__).parents[1] / "sample_sessions"
 VIEW = CameraView((2.0, 638.0), (452.0, 638.0), 60.0, (2.0, 188.0), 60.0)
 
 pytestmark = pytest.mark.usefixtures("state")
@@ -115,6 +117,16 @@ def test_one_line_is_tracked(labapp: Run, setup: Path, tmp_path: Path):
     assert code == 0
     shift = [float(row["shift_px"]) for row in rows(tmp_path / "out" / "track.csv")]
     assert np.diff(shift) == pytest.approx([0.5, 0.5, 0.5], abs=0.15)
+
+
+def test_measuring_names_only_the_frames_that_failed(labapp: Run, tmp_path: Path):
+    folder = Path(shutil.copytree(SAMPLES / "gmaw", tmp_path / "gmaw"))
+    arguments = ("session", "measure", folder / "gmaw.labsession", "--frames", "0:12")
+    code, stdout, stderr = labapp(*arguments)
+    assert code == 0
+    assert "followed" in stdout
+    assert "pulse" in stdout
+    assert "frame " not in stderr
 
 
 def test_current_needs_a_tracked_line(labapp: Run, setup: Path, tmp_path: Path):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from labapp.gui.shell.actions import ACTIONS
-from labapp.gui.shell.steps import STEPS, Step
+from labapp.gui.shell.steps import STEPS, Mark, Step
 
 GUIDE = Path(__file__).resolve().parent.parent / "docs" / "guide"
 PAGES = sorted(GUIDE.glob("*.md"))
@@ -25,13 +25,14 @@ def test_every_step_has_a_page_that_begins_with_its_hint(step: Step):
     assert one_line(hint) == step.hint
 
 
-def test_index_contains_the_introduction_of_the_app():
+def test_index_lists_every_step_and_the_marks_of_the_steps():
     pytest.importorskip("PySide6")
-    from labapp.gui.shell.help import CLOSING, INTRODUCTION
+    from labapp.gui.shell.step_list import SIGNS
 
     index = one_line((GUIDE / "index.md").read_text("utf-8"))
-    for paragraph in re.findall(r"<p>(.*?)</p>", INTRODUCTION + CLOSING, re.S):
-        assert one_line(paragraph) in index
+    for number, step in enumerate(STEPS, 1):
+        assert f"| {number} | [{step.title}]({step.key}.md)" in index
+    assert ", ".join(f"{SIGNS[mark]} {mark.value}" for mark in Mark) in index
 
 
 def test_keys_of_the_index_belong_to_actions():

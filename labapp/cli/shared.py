@@ -15,6 +15,7 @@ import typer.core
 from labapp.core.schemes import SCHEMES, scheme_words
 from labapp.errors import InputError, os_errors_as_input
 from labapp.files import write_file
+from labapp.session.results.statuses import is_failed
 from labapp.system import quoted
 from labapp.text import pluralize
 
@@ -183,13 +184,13 @@ def warned(setup: Setup) -> Setup:
 
 
 def progress_sink(progress: Progress, name: str, count: int) -> Sink:
-    """Return a sink that shows the number of results, and why a frame has no surface."""
+    """Return a sink that shows the number of results, and why a frame could not be measured."""
     task = progress.add_task(name, total=count)
 
     def show(result: FrameResult) -> None:
         progress.advance(task)
         measurement = result.measurement
-        if measurement.status != "ok":
+        if is_failed(measurement.status):
             why = f"{measurement.status}: {measurement.reason}"
             note(progress.console, f"frame {result.frame}: {why}")
 

@@ -18,7 +18,7 @@ from labapp.system import quoted
 from labapp.text import pluralize, with_sigma
 
 if TYPE_CHECKING:
-    from labapp.run.study.status import Progress
+    from labapp.run.study.status import StudyProgress
     from labapp.run.study.study import Study
 
 app = typer.Typer(
@@ -90,7 +90,7 @@ def run(
     with progress_bar() as bar:
         task = bar.add_task(study.stem, total=None)
 
-        def show(now: Progress) -> None:
+        def show(now: StudyProgress) -> None:
             words = f"{study.stem}: {now.recordings_done} of {now.recordings} recordings, frames"
             bar.update(task, description=words, completed=now.frames_done, total=now.frames or None)
 

@@ -262,18 +262,15 @@ def draw_mode(plot: Any, found: Dynamics, one: ModeCourse, turn: float = 0.0) ->
 
 def dynamics_pictures(found: Dynamics) -> dict[str, Figure]:
     """Return the figures by name: ``dynamics`` and ``modes``."""
-    from matplotlib import rc_context
+    from labapp.studies.plotting import INCHES, new_figure
 
-    from labapp.studies.plotting import INCHES, STYLE, new_figure
-
-    with rc_context(STYLE):
-        whole = new_figure(INCHES, 7.5)
+    with new_figure(INCHES, 7.5) as whole:
         gram, spectrum, *series = whole.subplots(5, 1)
         draw_spectrogram(gram, found)
         draw_spectrum(spectrum, found)
         for plot, name in zip(series, ("width_mm", "length_mm", "height_mm"), strict=True):
             draw_series(plot, found, name)
-        modes = new_figure(INCHES, 4.2)
+    with new_figure(INCHES, 4.2) as modes:
         for plot, one in zip(modes.subplots(2, 4).flat, found.all_modes, strict=False):
             draw_mode(plot, found, one)
     return {"dynamics": whole, "modes": modes}

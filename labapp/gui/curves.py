@@ -27,6 +27,11 @@ def _none() -> IntArray:
     return np.zeros(0, np.int64)
 
 
+def titled(name: str, unit: str) -> str:
+    """Name of a quantity, and its unit if it has one."""
+    return f"{name} ({unit})" if unit else name
+
+
 @dataclass(frozen=True)
 class Curve(ReadOnlyArrays):
     """One curve of a plot; n points."""
@@ -40,8 +45,8 @@ class Curve(ReadOnlyArrays):
     sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
     """± of each y, shape (n,); NaN where it is unknown. Empty: no error bars."""
     key: IntArray = field(default_factory=_none)
-    """Identifier of each point (a frame number), ascending, shape (n,). If empty, only the line is
-    drawn and no point can be selected.
+    """Frame number of each point, ascending, shape (n,). If empty, only the line is drawn and no
+    point can be selected.
     """
     mark: IntArray = field(default_factory=_none)
     """Index of each point's mark, shape (n,); empty if ``key`` is."""
@@ -64,7 +69,7 @@ class Curve(ReadOnlyArrays):
     @property
     def title(self) -> str:
         """Name and unit."""
-        return f"{self.name} ({self.unit})" if self.unit else self.name
+        return titled(self.name, self.unit)
 
 
 @dataclass(frozen=True)
@@ -76,15 +81,13 @@ class Axis:
     """"Time", "s"."""
     decimals: int = 4
     """Decimals of a position on the axis, in text."""
-    key_name: str = "frame"
-    """Meaning of a point's key: "frame"."""
     span: tuple[float, float] | None = None
     """Both ends of the range that is always visible; None: the range of the curves."""
 
     @property
     def title(self) -> str:
         """Name and unit."""
-        return f"{self.name} ({self.unit})" if self.unit else self.name
+        return titled(self.name, self.unit)
 
 
 def point_text(curve: Curve, index: int, axis: Axis) -> str:
@@ -95,7 +98,7 @@ def point_text(curve: Curve, index: int, axis: Axis) -> str:
     place, _ = rounded(float(curve.x[index]), None, axis.decimals)
     where = f"{axis.name.lower()} {place} {axis.unit}".strip()
     if len(curve.key):
-        where = f"{axis.key_name} {curve.key[index]}" + (f", {place} s" * (axis.unit == "s"))
+        where = f"frame {curve.key[index]}" + (f", {place} s" * (axis.unit == "s"))
         mark = curve.mark[index]
         where += f", {curve.marks[mark].words}" if mark else ""
     return f"{where[0].upper()}{where[1:]}: {message}"
@@ -127,15 +130,14 @@ def as_table(curves: Sequence[Curve], axis: Axis) -> str:
     """Values of all curves with keys as tab-separated text with a header, for a spreadsheet."""
     keyed = [curve for curve in curves if len(curve.key)]
     keys = np.unique(np.concatenate([curve.key for curve in keyed])) if keyed else _none()
-    names = [axis.key_name, axis.title]
-    columns: list[list[str]] = [[str(key) for key in keys], _spread_out(keys, keyed, axis)]
+    names = ["frame", axis.title]
+    columns: list[list[str]] = [[str(key) for key in keys], _spread_out(keys, keyed)]
     for curve in keyed:
         names.append(curve.title)
-        columns.append(_cells(keys, curve.key, [f"{value:.9g}" for value in curve.y]))
+        columns.append(_cells(keys, curve.key, _numbers(curve.y)))
         if np.isfinite(curve.sigma).any():
-            names.append(f"{curve.name} σ ({curve.unit})")
-            sigma = ["" if np.isnan(value) else f"{value:.9g}" for value in curve.sigma]
-            columns.append(_cells(keys, curve.key, sigma))
+            names.append(titled(f"{curve.name} σ", curve.unit))
+            columns.append(_cells(keys, curve.key, _numbers(curve.sigma)))
     if keyed:
         names.append("mark")
         words = [keyed[0].marks[mark].words for mark in keyed[0].mark]
@@ -144,11 +146,15 @@ def as_table(curves: Sequence[Curve], axis: Axis) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _spread_out(keys: IntArray, keyed: Sequence[Curve], axis: Axis) -> list[str]:
+def _spread_out(keys: IntArray, keyed: Sequence[Curve]) -> list[str]:
     places: dict[int, float] = {}
     for curve in keyed:
         places.update(zip(curve.key.tolist(), curve.x.tolist(), strict=True))
     return [f"{places[key]:.9g}" for key in keys.tolist()]
+
+
+def _numbers(values: FloatArray) -> list[str]:
+    return ["" if np.isnan(value) else f"{value:.9g}" for value in values]
 
 
 def _cells(keys: IntArray, own: IntArray, texts: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ from PySide6.QtWidgets import QApplication
 from labapp.errors import InputError
 from labapp.gui.tasks import Control, Task, Tasks
 from labapp.media.devices import hid
-from labapp.media.devices.foot_switch import Action, FootSwitch, Learned, PedalMap, learn
+from labapp.media.devices.foot_switch import FootSwitch, Learned, PedalAction, PedalMap, learn
 from labapp.media.devices.hid import AWAY, LONGEST, UNPLUGGED, HidError, HidInfo
 from labapp.media.events import Event
 
@@ -25,13 +25,13 @@ POLL_MS = 20
 DEAF_S = 0.5
 """Time, s, in which presses are ignored after one that was learned."""
 
-DOES: dict[Action, str] = {
+DOES: dict[PedalAction, str] = {
     "trigger": "record, or end it",
     "mark": "mark the moment",
     "next": "go to the next step",
 }
 
-CALLS: dict[Action, str] = {"trigger": "record", "mark": "mark", "next": "next_step"}
+CALLS: dict[PedalAction, str] = {"trigger": "record", "mark": "mark", "next": "next_step"}
 """Names of the window's menu actions."""
 
 
@@ -115,7 +115,7 @@ class FootSwitches(QObject):
         self._deaf_until_s = 0.0
         self._learning: Task | None = None
         self._looking: Task | None = None
-        self._received: queue.SimpleQueue[tuple[str, Action | Event]] = queue.SimpleQueue()
+        self._received: queue.SimpleQueue[tuple[str, PedalAction | Event]] = queue.SimpleQueue()
         self._timer = QTimer(self, interval=POLL_MS)
         self._timer.timeout.connect(self._take)
         tasks.changed.connect(self.changed)
@@ -140,7 +140,7 @@ class FootSwitches(QObject):
             each.switch.stop()
         self.in_use.clear()
 
-    def assign(self, key: str, pedal: int, action: Action | None) -> None:
+    def assign(self, key: str, pedal: int, action: PedalAction | None) -> None:
         """Assign another action to a pedal of a device in use; None: no action."""
         switch = self.in_use[key].switch
         switch.pedals = switch.pedals.with_action(pedal, action)
@@ -182,7 +182,7 @@ class FootSwitches(QObject):
             elif not deaf:
                 self._do(received)
 
-    def _do(self, action: Action) -> None:
+    def _do(self, action: PedalAction) -> None:
         if action == "next" and QApplication.activeModalWidget() is not None:
             self.notified.emit(
                 "The pedal goes to the next step when the question is answered", False
@@ -242,7 +242,7 @@ class FootSwitches(QObject):
         self.learned = None
         self.changed.emit()
 
-    def use_learned(self, action: Action) -> None:
+    def use_learned(self, action: PedalAction) -> None:
         """Assign an action to the learned pedal, and store it."""
         learned, self.learned = self.learned, None
         if learned is None:
@@ -254,9 +254,9 @@ class FootSwitches(QObject):
             self._keep()
 
     @property
-    def proposed(self) -> Action:
+    def proposed(self) -> PedalAction:
         """Current action of the learned pedal, or else the first action that no pedal has."""
-        actions: dict[int, Action] = {}
+        actions: dict[int, PedalAction] = {}
         if self.learned is not None and self.learned.info.key in self.in_use:
             actions = dict(self.in_use[self.learned.info.key].pedals.actions)
         if self.learned is not None and self.learned.pedal in actions:

@@ -12,6 +12,7 @@ import numpy as np
 
 from labapp.errors import InputError
 from labapp.gui.drafts import is_draft
+from labapp.session.results.statuses import PULSE, is_failed, is_measured
 from labapp.text import pluralize
 
 if TYPE_CHECKING:
@@ -57,11 +58,12 @@ def look_at(path: Path) -> Recent:
 def _counted(statuses: Sequence[str]) -> str:
     if not statuses:
         return "no recording yet"
-    measured = sum(status == "ok" for status in statuses)
-    without = sum(status not in ("", "ok") for status in statuses)
+    measured, failed = sum(map(is_measured, statuses)), sum(map(is_failed, statuses))
+    pulses = statuses.count(PULSE)
     some = "all" if measured == len(statuses) else measured or "none"
     message = f"{pluralize(len(statuses), 'frame')}, {some} measured"
-    return f"{message}, {without} failed" if without else message
+    message += f", {pluralize(pulses, 'pulse')}" if pulses else ""
+    return f"{message}, {failed} failed" if failed else message
 
 
 def _thumbnail(session: Session, frames: np.ndarray) -> GreyImage | None:

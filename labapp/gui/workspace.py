@@ -15,6 +15,7 @@ from PySide6.QtCore import QObject, Signal
 
 from labapp.gui.drafts import folder_of
 from labapp.gui.tasks import DONE, PROBLEM, Control, Task, Tasks, error_text
+from labapp.session.results.statuses import is_failed
 from labapp.simulation import parallel
 from labapp.text import pluralize
 
@@ -259,7 +260,7 @@ class Workspace(QObject):
                 for done, (number, made) in enumerate(
                     session.measure_each(numbers, pool, warm=warm), 1
                 ):
-                    failed += made.status != "ok"
+                    failed += is_failed(made.status)
                     control.progress(done, len(numbers))
                     if number == self.frame:
                         control.part(None)

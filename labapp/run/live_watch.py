@@ -170,7 +170,7 @@ class LiveWatch:
         """Return the open stream of a kind, if any."""
         return self._streams.get(kind)
 
-    def standing(self) -> list[tuple[Event, float | None]]:
+    def notes_at_start(self) -> list[tuple[Event, float | None]]:
         """Return events for the notes of a new recording: limits, and alarms that hold."""
         limits = self.alarms.limits
         events: list[tuple[Event, float | None]] = []

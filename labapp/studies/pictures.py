@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -18,7 +17,7 @@ from labapp.simulation.forward import Reflections
 from labapp.simulation.positioning import Fate, SideView, side_view
 from labapp.simulation.render import RenderedFrame
 from labapp.studies.error_analysis import ErrorSurvey
-from labapp.studies.plotting import INCHES, STYLE, new_figure, row_colour
+from labapp.studies.plotting import INCHES, new_figure, row_colour
 from labapp.studies.positioning_tables import Coverage
 
 STYLES = (
@@ -47,8 +46,7 @@ OPEN_PLANE_MM = 1e4
 
 def positioning_picture(rig: Rig, width_mm: float, length_mm: float, height_mm: float) -> Figure:
     """Fig. 4-7 … 4-9: the central rays via a flat, a convex and a concave pool, L1 and L2."""
-    with rc_context(STYLE):
-        figure = new_figure(INCHES * 0.7, 6.4)
+    with new_figure(INCHES * 0.7, 6.4) as figure:
         plots = figure.subplots(3, sharex=True, sharey=True)
         for plot, name, height in zip(
             plots, ("flat", "convex", "concave"), (0.0, height_mm, -height_mm), strict=True
@@ -89,8 +87,7 @@ def _draw_side(plot: Any, view: SideView) -> None:
 
 def coverage_picture(placements: Sequence[Coverage]) -> Figure:
     """Fig. 4-11: the dots on the plane at several distances of the plane."""
-    with rc_context(STYLE):
-        figure = new_figure(INCHES, INCHES)
+    with new_figure(INCHES, INCHES) as figure:
         for plot, one in zip(figure.subplots(2, 2).ravel(), placements, strict=True):
             plot.add_patch(Rectangle((0, 0), PLATE_MM, PLATE_MM, fc="none", ec="k", lw=1))
             plot.plot(*one.plane_mm[one.on_plane].T, "o", ms=2.5, color="#1b4f8a")
@@ -108,8 +105,7 @@ def correspondence_picture(seen: Reflections, title: str) -> Figure:
     One colour per row of rays, alternating markers by column; thin lines join neighbours in a row.
     """
     markers = "os^vD<>p*"
-    with rc_context(STYLE):
-        figure = new_figure(INCHES, 3.4)
+    with new_figure(INCHES, 3.4) as figure:
         plane, pool = figure.subplots(1, 2)
         for row in range(len(seen.lit)):
             columns = np.flatnonzero(seen.lit[row] & np.isfinite(seen.plane_mm[row]).all(axis=-1))
@@ -149,8 +145,7 @@ def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> F
     Lines join the means over the centres of a cap; bars extend from the least to the largest value.
     """
     size = np.array([(cap.footprint.width_mm, cap.peak_mm) for cap in survey.caps])
-    with rc_context(STYLE):
-        figure = new_figure(INCHES, 4.5)
+    with new_figure(INCHES, 4.5) as figure:
         plots = figure.subplots(2, 2, sharex=True, sharey="row")
         for line, (error, label, scale) in zip(plots, rows, strict=True):
             for plot, sign in zip(line, (1, -1), strict=True):
@@ -198,8 +193,7 @@ def _capped(plot: Any, survey: ErrorSurvey, error: str, scale: float) -> None:
 
 def bars_picture(names: Sequence[str], values: dict[str, FloatArray], label: str) -> Figure:
     """Contributions of several quantities as bars, in the colours of `COLOURS`."""
-    with rc_context(STYLE):
-        figure = new_figure(INCHES, 0.32 * len(names) + 0.8)
+    with new_figure(INCHES, 0.32 * len(names) + 0.8) as figure:
         plot = figure.subplots()
         at, thick = np.arange(len(names)), 0.8 / len(values)
         for k, (name, each) in enumerate(values.items()):
@@ -215,8 +209,7 @@ def bars_picture(names: Sequence[str], values: dict[str, FloatArray], label: str
 
 def frame_picture(frame: RenderedFrame) -> Figure:
     """A rendered frame as a negative, with rings at the true positions of its dots."""
-    with rc_context(STYLE):
-        figure = new_figure(INCHES / 2, INCHES / 2 * frame.image.shape[0] / frame.image.shape[1])
+    with new_figure(INCHES / 2, INCHES / 2 * frame.image.shape[0] / frame.image.shape[1]) as figure:
         plot = figure.subplots()
         low, high = np.percentile(frame.image, [1, 99.8])
         plot.imshow(frame.image, cmap="gray_r", vmin=low, vmax=max(high, low + 1))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import colorsys
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -25,11 +27,13 @@ STYLE = {
 """Parameters for ``rc_context``, in which pictures are drawn and written."""
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in inches, without a window."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+@contextmanager
+def new_figure(width: float, height: float) -> Iterator[Figure]:
+    """An empty figure of a size in inches, without a window; drawn in `STYLE` by the block."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
 
 
 def as_bytes(figure: Figure, kind: str = "png", dpi: int = 120) -> bytes:

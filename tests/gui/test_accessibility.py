@@ -42,7 +42,7 @@ from labapp.gui.shell.help import HelpDialog
 from labapp.gui.shell.steps import STEPS
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import TOOLS
-from labapp.gui.tools.dynamics_shown import draw
+from labapp.gui.tools.dynamics_presenter import draw
 from labapp.gui.tools.tool import ToolWindow
 from labapp.gui.views.canvas import Drawn, Plotted
 from labapp.run.study.plan import StudyPlan, StudyRecording

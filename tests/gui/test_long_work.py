@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.shell.standing import FrameStatus
+from labapp.gui.shell.frame_status import FrameStatus
 from labapp.gui.shell.window import MainWindow
 from labapp.media.survey import Survey, survey
 from labapp.session import frames as frames_module

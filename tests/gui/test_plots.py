@@ -78,6 +78,14 @@ def test_table_for_a_spreadsheet() -> None:
     assert as_table([current()], TIME) == "frame\tTime (s)\n"
 
 
+def test_table_of_a_quantity_without_a_unit_and_of_gaps() -> None:
+    y, sigma = np.array([0.5, np.nan]), np.array([0.1, np.nan])
+    plain = replace(curve(2, "Asymmetry"), unit="", y=y, sigma=sigma)
+    lines = as_table([plain], TIME).splitlines()
+    assert lines[0].split("\t") == ["frame", "Time (s)", "Asymmetry", "Asymmetry σ", "mark"]
+    assert lines[2].split("\t") == ["2", "0.2", "", "", "measured"]
+
+
 @pytest.fixture
 def view(qtbot: QtBot) -> Iterator[PlotStack]:
     view = PlotStack("Trends")

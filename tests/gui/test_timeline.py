@@ -6,7 +6,7 @@ from PySide6.QtCore import QPoint, Qt
 from PySide6.QtGui import QImage
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.shell.standing import FrameStatus, next_frame, standings
+from labapp.gui.shell.frame_status import FrameStatus, frame_statuses, next_frame
 from labapp.gui.shell.window import TICKS
 from labapp.gui.widgets.scrubber import aggregated
 from labapp.gui.widgets.timeline import Timeline
@@ -38,7 +38,7 @@ def test_frame_status():
         [False, False, True, True, False, True, True],
         [False, False, False, True, False, False, False],
     )
-    assert [FrameStatus(kind).name for kind in standings(results)] == [
+    assert [FrameStatus(kind).name for kind in frame_statuses(results)] == [
         "NOT_MEASURED", "MEASURED", "CORRECTED", "DOUBTFUL", "NOT_MEASURABLE", "CORRECTED",
         "NOT_MEASURABLE",
     ]  # fmt: skip
@@ -50,7 +50,7 @@ def test_outlying_frame_is_doubtful():
     none = np.zeros(40, bool)
     measures = dict.fromkeys(MEASURES, np.full(40, 1.0)) | {"width_mm": width}
     results = Overview(np.arange(40), np.arange(40) / 60, ("ok",) * 40, none, none, measures)
-    assert np.flatnonzero(standings(results) == FrameStatus.DOUBTFUL).tolist() == [17]
+    assert np.flatnonzero(frame_statuses(results) == FrameStatus.DOUBTFUL).tolist() == [17]
 
 
 def test_next_frame():

@@ -14,7 +14,7 @@ from pytestqt.qtbot import QtBot
 from labapp.core.geometry.rig import ImagingPlane, Laser
 from labapp.gui.pages.setup.page import SetupPage
 from labapp.gui.shell.window import MainWindow
-from labapp.gui.tools import advising
+from labapp.gui.tools import adviser_presenter
 from labapp.gui.tools.adviser import AdviserWindow
 from labapp.session.session import Session
 from labapp.studies.adviser.keys import parse_request
@@ -54,7 +54,7 @@ def click(button: QPushButton) -> None:
 def test_request_has_the_pool_and_rig_of_the_session(copy_sample: CopySample):
     with Session.open(copy_sample("gtaw")) as session:
         session.calibrate_laser([4.64, 4.68], [6.26, 6.21], [2.75, 2.78])
-        values = advising.question(session)
+        values = adviser_presenter.question(session)
         expected, limits = parse_request(values, "here")
         known = session.setup.rig.uncertainty
     # The covariance of the session's set-up, including correlations.
@@ -63,7 +63,7 @@ def test_request_has_the_pool_and_rig_of_the_session(copy_sample: CopySample):
     assert expected.kind == "convex"
     assert limits.angle_deg == (25.0, 35.0)
     assert limits.pattern.rows == 19
-    parse_request(advising.question(None), "here")
+    parse_request(adviser_presenter.question(None), "here")
 
 
 def test_advice_equals_that_of_the_command_and_can_be_undone(

@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QApplication, QPushButton
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.shell.window import MainWindow
-from labapp.gui.tools import analysing
+from labapp.gui.tools import analysis_presenter
 from labapp.gui.tools.analysis import AnalysisWindow
 from labapp.session.session import Session
 from labapp.studies import error_analysis, predicted_budget
@@ -103,7 +103,7 @@ def test_budget_is_computed_for_the_setup_of_the_session(
 def test_parts_equal_those_of_the_command(
     analysis: AnalysisWindow, labapp: Run, qtbot: QtBot, tmp_path: Path
 ):
-    assert tuple(analysis.parts) == (analysing.BUDGET, *PARTS)
+    assert tuple(analysis.parts) == (analysis_presenter.BUDGET, *PARTS)
     tick(analysis, "CE", "LE", "parameters")
     analysis.scheme.set_value("ers")
     analysis.step.set_value(10)
@@ -184,11 +184,11 @@ def test_impossible_input_is_rejected(analysis: AnalysisWindow, window: MainWind
 
 
 def test_default_size_without_a_setup(copy_sample: CopySample, tmp_path: Path):
-    assert not analysing.has_setup(None)
-    assert analysing.expected_mm(None) == (6.0, 7.0, 0.3)
+    assert not analysis_presenter.has_setup(None)
+    assert analysis_presenter.expected_mm(None) == (6.0, 7.0, 0.3)
     with Session.create(tmp_path / "new.labsession") as session:
-        assert not analysing.has_setup(session)
-        assert analysing.expected_mm(session) == (6.0, 7.0, 0.3)
+        assert not analysis_presenter.has_setup(session)
+        assert analysis_presenter.expected_mm(session) == (6.0, 7.0, 0.3)
     with Session.open(copy_sample("thumb_tack")) as session:
-        assert analysing.has_setup(session)
-        assert analysing.expected_mm(session) == (9.75, 9.75, 0.91)
+        assert analysis_presenter.has_setup(session)
+        assert analysis_presenter.expected_mm(session) == (9.75, 9.75, 0.91)

@@ -10,10 +10,12 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
+from labapp.errors import InputError
 from labapp.gui.pages.trends.page import TrendsPage
 from labapp.gui.shell.window import MainWindow
-from labapp.gui.tools import dynamics_shown
+from labapp.gui.tools import dynamics_presenter
 from labapp.gui.tools.dynamics import DynamicsWindow
+from labapp.session.session import Session
 from tests.conftest import Run
 from tests.core.dynamics_truth import analysed_step
 from tests.gui.conftest import CopySample
@@ -80,7 +82,7 @@ def test_events_are_marked_in_the_trends_and_select_their_frame(
     window.do("step_trends")
     (page,) = window.findChildren(TrendsPage)
     analysis = analysed_step()
-    tool.show_found(dynamics_shown.draw(analysis, lambda: None))
+    tool.show_found(dynamics_presenter.draw(analysis, lambda: None))
     (width,) = [curve for curve in page.plots.curves if curve.name == "Width"]
     assert width.events.tolist() == [one.time_s for one in analysis.events["width_mm"]]
     assert width.events[0] == pytest.approx(0.5, abs=0.05)
@@ -118,27 +120,47 @@ def test_missing_frame_rate_prevents_the_analysis(
     assert not tool.start_button.isEnabled()
 
 
+def test_damaged_session_is_reported(
+    tool: DynamicsWindow, window: MainWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(self: Session, scheme: str | None = None) -> None:
+        raise InputError(self.path, "table of results", "damaged", "what was written")
+
+    messages: list[tuple[str, bool]] = []
+    window.workspace.notified.connect(lambda words, problem: messages.append((words, problem)))
+    monkeypatch.setattr(Session, "overview", damaged)
+    window.workspace._forget()
+    for act in (tool.show_state, tool.prefill, tool.start):
+        messages.clear()
+        act()
+        assert messages
+        assert all("table of results: damaged" in words for words, _ in messages)
+        assert all(problem for _, problem in messages)
+    assert not tool.working
+    assert not tool.start_button.isEnabled()
+
+
 def test_too_few_frames_are_reported(window: MainWindow, copy_sample: CopySample) -> None:
     assert window.files.open(copy_sample("gtaw"))
     overview = window.workspace.overview()
     assert overview is not None
     session = window.workspace.session
-    assert dynamics_shown.impossible(session, overview) == ""
+    assert dynamics_presenter.impossible(session, overview) == ""
     few = {**overview.measures, "height_mm": np.where(overview.frame < 15, 0.3, np.nan)}
     object.__setattr__(overview, "measures", few)
-    assert "15 of 30" in dynamics_shown.impossible(session, overview)
+    assert "15 of 30" in dynamics_presenter.impossible(session, overview)
 
 
 def test_tables_show_the_simulated_values() -> None:
     analysis = analysed_step()
-    rows = {str(row[0]): row for row in dynamics_shown.modes_table(analysis).rows}
+    rows = {str(row[0]): row for row in dynamics_presenter.modes_table(analysis).rows}
     assert str(rows["(0, 1)"][2]).startswith("31.0")
     assert str(rows["(1, 1)"][2]).startswith("47.0")
-    response = dynamics_shown.responses_table(analysis).rows
+    response = dynamics_presenter.responses_table(analysis).rows
     assert {row[1] for row in response} == {"Width (mm)"}
     assert len(response) == 4  # the first order does not overshoot
     change = float(str(response[0][3]).partition(" ")[0])
     assert change == pytest.approx(0.5, abs=0.01)
-    table, frames = dynamics_shown.events_table(analysis)
+    table, frames = dynamics_presenter.events_table(analysis)
     assert len(frames) == len(table.rows) >= 2
     assert abs(frames[0] - 100) <= 4

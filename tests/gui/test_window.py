@@ -35,7 +35,7 @@ from labapp.session.copies import copy_sample as copied_sample
 from labapp.session.copies import copy_session
 from labapp.session.record import Record
 from labapp.session.session import Session
-from tests.gui.conftest import KEPT, CopySample, let_draw
+from tests.gui.conftest import KEPT, SAMPLES, CopySample, let_draw
 
 
 class Plain(Page):
@@ -655,6 +655,17 @@ def test_preview_of_a_session_does_not_change_it(copy_sample: CopySample, tmp_pa
     with Session.create(tmp_path / "new.labsession"):
         pass
     assert "no recording yet" in look_at(tmp_path / "new.labsession").about
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("gmaw", "96 frames, 58 measured, 38 pulses"),
+        ("blocked_rows", "6 frames, 3 measured, 3 failed"),
+    ],
+)
+def test_preview_counts_measured_and_failed_frames(name: str, words: str):
+    assert look_at(SAMPLES / name / f"{name}.labsession").about.endswith(f" · {words}")
 
 
 def test_uncaught_errors_are_logged_and_reported(plain: MainWindow, qtbot: QtBot):

@@ -10,6 +10,7 @@ import pytest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
+from labapp.gui.tasks import DONE
 from labapp.gui.workspace import Workspace
 from labapp.log import NAME
 from labapp.run import measurers
@@ -32,6 +33,21 @@ class Stuck(Executor):
     def end(self) -> None:
         for future in self.begun:
             future.cancel()
+
+
+def test_followed_frames_and_pulses_are_no_failures(
+    qapp: QApplication, state: object, copy_sample: CopySample, qtbot: QtBot
+) -> None:
+    workspace = Workspace()
+    messages: list[str] = []
+    workspace.notified.connect(lambda words, _: messages.append(words))
+    workspace.show(Session.open(copy_sample("gmaw")))
+    beside: list[str] = []
+    with qtbot.waitSignal(workspace.notified):
+        workspace.measure(range(12), beside=beside.append)
+    assert messages == ["12 frames measured"]
+    assert beside[-1] == f"{DONE} 12 frames measured"
+    workspace.close()
 
 
 def test_measuring_cancelled_by_another_session_is_no_fault(

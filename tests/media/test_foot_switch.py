@@ -14,7 +14,14 @@ import pytest
 
 from labapp.errors import InputError
 from labapp.media.devices import foot_switch, hid, space_mouse
-from labapp.media.devices.foot_switch import Action, FootSwitch, Learned, PedalMap, Pedals, learn
+from labapp.media.devices.foot_switch import (
+    FootSwitch,
+    Learned,
+    PedalAction,
+    PedalMap,
+    Pedals,
+    learn,
+)
 from labapp.media.devices.hid import (
     HidError,
     HidInfo,
@@ -162,7 +169,7 @@ def test_foot_switch_reconnects_and_reports_it() -> None:
 def test_failed_action_does_not_stop_the_foot_switch() -> None:
     device, actions, events = Device(), [], Events()
 
-    def do(action: Action) -> None:
+    def do(action: PedalAction) -> None:
         actions.append(action)
         if action == "trigger":
             raise OSError("no room")  # not an error of the pedal
@@ -404,4 +411,4 @@ def test_actions_agree_with_their_type() -> None:
 
     from labapp.media.devices.foot_switch import ACTIONS
 
-    assert get_args(Action) == ACTIONS
+    assert get_args(PedalAction) == ACTIONS

@@ -42,6 +42,7 @@ from labapp.cli.shared import (
 from labapp.core.schemes import scheme_words
 from labapp.errors import InputError
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS
+from labapp.session.results.statuses import is_measured
 from labapp.text import now, pluralize
 
 if TYPE_CHECKING:
@@ -274,7 +275,7 @@ def measure(
             return
         summary = measure_frames(session, chosen, warm=warm)
     typer.echo(summary.text())
-    if not summary.statuses["ok"] + summary.statuses["followed"]:
+    if not any(map(is_measured, summary.statuses)):
         raise typer.Exit(NOTHING_MEASURED)
 
 

@@ -14,7 +14,7 @@ from PySide6.QtWidgets import QFrame, QGridLayout, QLabel, QWidget
 from labapp.gui.digits import NOTHING, plain
 from labapp.gui.theme import RED, FollowsTheme, is_dark
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.labels import Message, plain_label, selectable_label
+from labapp.gui.widgets.labels import Message, plain_label, selectable_label, set_font
 from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
@@ -170,10 +170,7 @@ class LiveFigures(FollowsTheme, QWidget):
             if column in (1, 2):
                 label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
             if column == 1:
-                font = label.font()
-                font.setPointSizeF(LARGE * font.pointSizeF())
-                font.setBold(True)
-                label.setFont(font)
+                set_font(label, scale=LARGE)
             self._grid.addWidget(label, row, column)
         return self._labels[row, column]
 
@@ -204,9 +201,7 @@ class AlarmStrip(FollowsTheme, QFrame):
         super().__init__()
         self.setFrameShape(QFrame.Shape.Box)
         self.words = selectable_label()
-        font = self.words.font()
-        font.setBold(True)
-        self.words.setFont(font)
+        set_font(self.words)
         self.button = button(
             "Acknowledge", "Confirm that the alarms were seen (A); active ones stay", acknowledge
         )

@@ -348,7 +348,7 @@ class Live:
         parts += [f"lost {pluralize(counts.lost, 'time')}"] * (counts.lost > 0)
         return ", ".join(parts)
 
-    def ring(self) -> tuple[float, str]:
+    def before_trigger(self) -> tuple[float, str]:
         """Fill level of the memory for frames before a trigger, 0 … 1, and its text."""
         recorder = self._recorders[-1] if self._recorders else None
         wanted_s = (recorder or self).plan.before_s
@@ -392,7 +392,7 @@ class Live:
                 return
             self.takes.append(recorder.trigger())
         if self.watch is not None:
-            for event, time_s in self.watch.standing():
+            for event, time_s in self.watch.notes_at_start():
                 recorder.note(event, time_s)
 
     def discard(self, take: Take) -> bool:

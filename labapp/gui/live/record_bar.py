@@ -10,7 +10,7 @@ from PySide6.QtWidgets import QProgressBar, QWidget
 from labapp.gui.live.live import Live
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.labels import Message, plain_label
+from labapp.gui.widgets.labels import Message, plain_label, set_font
 from labapp.gui.widgets.layouts import hbox, vbox
 
 BEGIN, END = "● Record", "■ End recording"
@@ -51,9 +51,7 @@ class RecordBar(QWidget):
         for each, _ in buttons:
             each.setMinimumHeight(BUTTON_PX)
         self.mark_button.setMinimumWidth(BUTTON_PX)  # leaves room for the others at 150 %
-        font = self.record_button.font()
-        font.setBold(True)
-        self.record_button.setFont(font)
+        set_font(self.record_button)
         self.record_button.setText(END)
         self.record_button.setMinimumWidth(self.record_button.sizeHint().width())
         self.record_button.setText(BEGIN)
@@ -62,7 +60,7 @@ class RecordBar(QWidget):
     def show_status(self, live: Live) -> None:
         """Show the state of a camera and its recording."""
         self.state.setText(live.state_text())
-        part, message = live.ring()
+        part, message = live.before_trigger()
         self.ring.setValue(round(100 * part))
         self.ring.setFormat(message)
         self.ring.setAccessibleName(f"Kept from before the trigger: {message}")

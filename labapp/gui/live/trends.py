@@ -142,8 +142,7 @@ class LiveTrends(QWidget):
 
     def _others(self) -> FieldForm:
         form = FieldForm()
-        for field in (self.last, self.unmeasured):
-            form.add(field)
+        form.add(self.last, self.unmeasured)
         form.setMinimumWidth(form.minimumSizeHint().width())
         return form
 

@@ -22,7 +22,7 @@ from labapp.gui.recent import THUMBNAIL_PX, Recent, look_at
 from labapp.gui.shell.lead import action_button
 from labapp.gui.tasks import Control
 from labapp.gui.theme import FollowsTheme
-from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip, set_font, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox, scrolled, vbox
 from labapp.gui.workspace import Workspace
 
@@ -55,9 +55,7 @@ class Welcome(FollowsTheme, QWidget):
         inner = QWidget()
         inner.setMaximumWidth(WIDTH_PX)
         title = plain_label("labapp")
-        font = title.font()
-        font.setPointSizeF(font.pointSizeF() * 2.2)
-        title.setFont(font)
+        set_font(title, bold=False, scale=2.2)
         about = wrapping_label(
             "The surface of a molten weld pool, measured from the reflections of a laser "
             "pattern. An experiment is one session file; everything you do is saved in it at once."

@@ -1,9 +1,8 @@
-"""The guide, the keys and the information about the program, from the same data as the window."""
+"""The guide; the keys, from the same data as the window; information about the program."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,8 +15,6 @@ from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayo
 
 from labapp.bundled import bundled
 from labapp.gui.shell.actions import ACTIONS, MENUS
-from labapp.gui.shell.standing import FrameStatus
-from labapp.gui.shell.steps import STEPS
 from labapp.log import log_file
 from labapp.version import VERSION
 
@@ -31,32 +28,7 @@ SIZES_PX = {"guide": (900, 700), "keys": (720, 600), "about": (520, 300)}
 
 TITLES = {"guide": "Guide", "keys": "Keys", "about": "About labapp"}
 
-INTRODUCTION = """
-<p>The steps at the left lead from the bench to the results. Begin at the top. A mark shows how far
-each step is; point at it to see why: ○ to do, ▶ ready, ✓ done, ▲ needs attention. You may go
-back at any time.</p>
-<p>Everything is saved as you do it: there is no Save. Every change of set-up, calibration,
-settings, dots and rows can be undone (Ctrl+Z), also after the session was closed.</p>
-"""
-CLOSING = """
-<p>Drop a video, an image, a folder of images or a session on the window to open it. Long work runs
-in the background: the status line shows how far it is, Cancel stops it, and what was finished is
-kept. A problem stays in the status line until you have read it; F4 shows all messages.</p>
-"""
-
-
-def guide() -> str:
-    """Step-by-step instructions as HTML."""
-    steps = "".join(
-        f"<h3>{number} {escape(step.title)}</h3><p>{escape(step.hint)}</p>"
-        for number, step in enumerate(STEPS, 1)
-    )
-    ticks = "".join(f"<li>{escape(standing.words)}</li>" for standing in FrameStatus)
-    frames = (
-        "<h3>The frames</h3><p>The bar at the bottom has a tick for every frame. Its colour, its "
-        f"height and its tip show the state of the frame:</p><ul>{ticks}</ul>"
-    )
-    return f"<h2>Guide</h2>{INTRODUCTION}{steps}{frames}{CLOSING}"
+NO_GUIDE = "<p>The guide did not come with this installation.</p>"
 
 
 def keys(page: Page | None = None) -> str:
@@ -102,9 +74,6 @@ def about() -> str:
     )
 
 
-TEXTS: dict[str, Callable[[], str]] = {"guide": guide, "keys": keys, "about": about}
-
-
 class GuidePages(QTextBrowser):
     """Shows pages of the guide; their pictures are made to fit its width."""
 
@@ -114,12 +83,13 @@ class GuidePages(QTextBrowser):
         self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOn)  # the width stays
         self.anchorClicked.connect(self._follow)
 
-    def show_page(self, name: str) -> bool:
-        """Show a page; False where the guide did not come with the program."""
+    def show_page(self, name: str) -> None:
+        """Show a page."""
         file = bundled("docs/guide") / f"{name}.md"
         if file.is_file():
             self.setSource(QUrl.fromLocalFile(str(file)))
-        return file.is_file()
+        else:
+            self.setHtml(NO_GUIDE)
 
     def _follow(self, link: QUrl) -> None:
         url = self.source().resolved(link)
@@ -159,9 +129,10 @@ class HelpDialog(QDialog):
         wanted = QSize(*SIZES_PX[kind])
         self.resize(wanted.boundedTo(self.screen().availableSize() * PART_OF_SCREEN))
         layout.activate()  # pictures are scaled to fit
-        name = "welcome" if page is None else page.key
-        if kind != "guide" or not self.browser.show_page(name):
-            self.browser.setHtml(keys(page) if kind == "keys" else TEXTS[kind]())
+        if kind == "guide":
+            self.browser.show_page("welcome" if page is None else page.key)
+        else:
+            self.browser.setHtml(keys(page) if kind == "keys" else about())
 
 
 def _key(action: QAction) -> str:

@@ -13,7 +13,7 @@ from labapp.core.values import FloatArray
 from labapp.gui.shell.actions import ACTIONS
 from labapp.gui.shell.steps import Lead, Offer
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.labels import Message, wrapping_label
+from labapp.gui.widgets.labels import Message, set_font, wrapping_label
 from labapp.gui.widgets.layouts import hbox, vbox
 
 WORDS_PX = 340
@@ -73,9 +73,7 @@ class EmptyState(QWidget):
             each.deleteLater()
         self.buttons = [self._button(each) for each in lead.actions]
         for k, made in enumerate(self.buttons):
-            font = made.font()
-            font.setBold(k == 0)
-            made.setFont(font)
+            set_font(made, bold=k == 0)
             made.setDefault(k == 0)
             made.setMinimumHeight(made.fontMetrics().height() * (2 if k == 0 else 1) + 8)
             self._column.addWidget(made)

@@ -18,7 +18,7 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.tasks import PROBLEM, Tasks
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.labels import Message, plain_label
+from labapp.gui.widgets.labels import Message, plain_label, set_font
 from labapp.gui.widgets.layouts import fill
 
 KEPT_MESSAGES = 1000
@@ -56,9 +56,7 @@ class LogPanel(QListWidget):
             return
         item = QListWidgetItem(f"{now}  {message}")
         item.setData(TOLD, (message, now, 1))
-        font = item.font()
-        font.setBold(problem)
-        item.setFont(font)
+        set_font(item, bold=problem)
         self.addItem(item)
         if self.count() > KEPT_MESSAGES:
             self.takeItem(0)
@@ -161,7 +159,5 @@ class StatusLine(QWidget):
         count = len(self.unread)
         more = f" ({count} problems)" if count > 1 else ""
         self.message.setText(f"{PROBLEM} {text}{more}" if count else text)
-        font = self.message.font()
-        font.setBold(count > 0)
-        self.message.setFont(font)
+        set_font(self.message, bold=count > 0)
         self.dismiss_button.setVisible(count > 0)

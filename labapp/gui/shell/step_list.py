@@ -28,7 +28,7 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.shell.steps import READ_ONLY, Mark, State, Step
 from labapp.gui.theme import FollowsTheme, is_dark
-from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip, set_font, wrapping_label
 from labapp.gui.widgets.layouts import fill, scrolled
 
 ICON_PX = 18
@@ -178,10 +178,7 @@ class SidePanel(FollowsTheme, QWidget):
         super().__init__()
         self._shown: State | None = None
         self.title = plain_label()
-        font = self.title.font()
-        font.setPointSizeF(font.pointSizeF() * 1.25)
-        font.setBold(True)
-        self.title.setFont(font)
+        set_font(self.title, scale=1.25)
         self.hint = wrapping_label()
         self.state = Message(STATE_LINES)
         self.read_only = wrapping_label(f"⚠ {READ_ONLY} until it is opened again for changes.")

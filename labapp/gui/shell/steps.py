@@ -12,6 +12,7 @@ import numpy as np
 
 from labapp.core.geometry.uncertainty import ENDINGS
 from labapp.errors import InputError
+from labapp.session.results.statuses import is_failed
 from labapp.text import pluralize, split_unit
 
 if TYPE_CHECKING:
@@ -154,9 +155,9 @@ class Facts:
     """Problems of the set-up."""
     count: int = 0
     measured: int = 0
-    without: int = 0
+    failed: int = 0
     stale: int = 0
-    """Number of all frames, and of measured ones, those without a surface and stale ones."""
+    """Number of all frames, of those with a result, of failed and of stale ones."""
 
     @property
     def checked(self) -> str:
@@ -178,14 +179,12 @@ def _facts(session: Session, seen: Overview | None) -> Facts:
     if session.recording is None:
         return Facts(session, problems)
     seen = seen or session.overview()
-    status = np.array(seen.status, dtype=object)
-    measured = status != ""
     return Facts(
         session,
         problems,
         count=len(seen.frame),
-        measured=int(measured.sum()),
-        without=int((measured & ~np.isin(status, ("ok", "followed", "pulse"))).sum()),
+        measured=sum(status != "" for status in seen.status),
+        failed=sum(map(is_failed, seen.status)),
         stale=int(seen.stale.sum()),
     )
 
@@ -240,8 +239,8 @@ def _capture(facts: Facts) -> State:
 
 
 def _dots(facts: Facts) -> State:
-    if facts.without:
-        missing, seen = pluralize(facts.without, "frame"), _seen(facts.session)
+    if facts.failed:
+        missing, seen = pluralize(facts.failed, "frame"), _seen(facts.session)
         return State(Mark.ATTENTION, f"{missing} could not be measured: check the {seen}")
     if facts.stale:
         return State(Mark.READY, f"{pluralize(facts.stale, 'frame')} to be measured again")
@@ -262,11 +261,11 @@ def _surface(facts: Facts) -> State:
         return State(Mark.ATTENTION, f"{facts.stale} of {frames} out of date: measure again")
     if facts.measured < facts.count:
         return State(Mark.READY, f"{facts.count - facts.measured} of {frames} not measured yet")
-    if facts.without == facts.count:
+    if facts.failed == facts.count:
         return State(Mark.ATTENTION, no_surface(facts.count))
-    if facts.without:
-        measured = f"{facts.count - facts.without} of {frames} are measured"
-        return State(Mark.DONE, f"{measured}, {facts.without} could not be")
+    if facts.failed:
+        measured = f"{facts.count - facts.failed} of {frames} are measured"
+        return State(Mark.DONE, f"{measured}, {facts.failed} could not be")
     every = f"All {facts.count} frames are" if facts.count > 1 else "The frame is"
     return State(Mark.DONE, f"{every} measured")
 
@@ -278,7 +277,7 @@ def no_surface(count: int) -> str:
 
 def results(facts: Facts) -> State:
     """State of a step that needs only results: ready as soon as there are any."""
-    if facts.measured and facts.without == facts.measured:
+    if facts.measured and facts.failed == facts.measured:
         return State(Mark.ATTENTION, f"{no_surface(facts.measured)}: see step 6")
     if facts.measured:
         return State(Mark.READY, pluralize(facts.measured, "frame"))

@@ -30,11 +30,11 @@ from labapp.gui.preferences import THEMES, PreferencesStore
 from labapp.gui.shell.actions import ACTIONS, Needs
 from labapp.gui.shell.files import Files, title
 from labapp.gui.shell.focus import finish_edit, show_in
+from labapp.gui.shell.frame_status import TICKS, TO_CHECK, frame_statuses, next_frame
 from labapp.gui.shell.lead import EmptyState
 from labapp.gui.shell.menus import Menus, steps_of
 from labapp.gui.shell.messages import LogPanel, StatusLine
 from labapp.gui.shell.setups import Setups
-from labapp.gui.shell.standing import DOUBTFUL, TICKS, next_frame, standings
 from labapp.gui.shell.step_list import SidePanel, StepList
 from labapp.gui.shell.steps import STEPS, Lead, first_frame, first_step, lead, read_only, states
 from labapp.gui.theme import apply_theme
@@ -81,7 +81,7 @@ class MainWindow(QMainWindow):
         """Pages created so far, by key."""
         self.files = Files(self, self.workspace, preferences, lambda: self.camera)
         self.setups = Setups(self, self.workspace, preferences)
-        self.standings: IntArray = np.zeros(0, np.int64)
+        self.frame_statuses: IntArray = np.zeros(0, np.int64)
         """State of each frame (`FrameStatus`), shape (n,)."""
         self.page: Page | None = None
         """The page in view; None for the welcome page."""
@@ -177,7 +177,7 @@ class MainWindow(QMainWindow):
 
     def _show_actions(self) -> None:
         """Update which actions of the menus are enabled and checked."""
-        session, frames = self.workspace.session, len(self.standings) > 0
+        session, frames = self.workspace.session, len(self.frame_statuses) > 0
         undo, redo = steps_of(session)
         there: dict[Needs, bool] = {
             "": True,
@@ -255,7 +255,7 @@ class MainWindow(QMainWindow):
         if session is None:
             return
         if kind == "doubtful":
-            wanted, words = np.isin(self.standings, DOUBTFUL), "in doubt"
+            wanted, words = np.isin(self.frame_statuses, TO_CHECK), "in doubt"
         else:
             corrected = session.corrected_frames()
             wanted, words = np.isin(session.frames, corrected), "corrected by hand"
@@ -343,11 +343,11 @@ class MainWindow(QMainWindow):
         session = self.workspace.session
         seen = self.workspace.run_or_report(self.workspace.overview)
         if seen is None:
-            self.standings = np.zeros(0, np.int64)
-            self.timeline.set_frames(self.standings, np.zeros(0), self.standings)
+            self.frame_statuses = np.zeros(0, np.int64)
+            self.timeline.set_frames(self.frame_statuses, np.zeros(0), self.frame_statuses)
         else:
-            self.standings = standings(seen)
-            self.timeline.set_frames(seen.frame, seen.time_s, self.standings)
+            self.frame_statuses = frame_statuses(seen)
+            self.timeline.set_frames(seen.frame, seen.time_s, self.frame_statuses)
         self.timeline.set_frame(self.workspace.frame)
         self._states = self.workspace.run_or_report(lambda: states(session, seen)) or states(None)
         own = {key: page.state(self._states[key]) for key, page in self.pages.items()}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtWidgets import QTabWidget, QVBoxLayout, QWidget
 
 from labapp.gui.tasks import Control
-from labapp.gui.tools import advising
+from labapp.gui.tools import adviser_presenter as presenter
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
@@ -60,26 +60,12 @@ class AdviserWindow(ToolWindow):
     def __init__(self, sessions: Files, window: QWidget) -> None:
         self.advice: Advice | None = None
         self._basis: object = None
-        self._asked: advising.Values = {}
+        self._asked: presenter.Values = {}
         super().__init__(sessions, window)
-        self.ranges: dict[str, RangeField] = {}
-        self.numbers: dict[str, NumberField] = {}
-        self._make_form()
-        self._make_results()
-        self.add_save_button(
-            "Save the advice…", "Write words, tables, picture and set-up file to a folder"
-        )
-        self.use_button = self.add_button(
-            "Apply",
-            "Apply this set-up to the session; undo restores the former one",
-            self.use,
-        )
-        self.start_button = self.add_button(
-            "Advise", "Search for the set-up with the least error of the height", self.start
-        )
-        self.show_state()
 
     def _make_form(self) -> None:
+        self.ranges: dict[str, RangeField] = {}
+        self.numbers: dict[str, NumberField] = {}
         kinds = (("convex", "convex"), ("concave", "concave"))
         self.kind = ChoiceField("Kind", kinds, tooltip="Above the work piece, or below it")
         efforts = (("thorough", "thorough: minutes"), ("quick", "quick: a tenth of the time"))
@@ -119,11 +105,24 @@ class AdviserWindow(ToolWindow):
         self.tabs.addTab(self.sheet, "Picture")
         self.results.addWidget(self.tabs)
 
+    def _make_buttons(self) -> None:
+        self.add_save_button(
+            "Save the advice…", "Write words, tables, picture and set-up file to a folder"
+        )
+        self.use_button = self.add_button(
+            "Apply",
+            "Apply this set-up to the session; undo restores the former one",
+            self.use,
+        )
+        self.start_button = self.add_button(
+            "Advise", "Search for the set-up with the least error of the height", self.start
+        )
+
     # --- asking ------------------------------------------------------------------------------
 
     def prefill(self) -> None:
         """Fill in pool and rig of the session if they changed since the last time."""
-        values = self.workspace.run_or_report(lambda: advising.question(self.workspace.session))
+        values = self.workspace.run_or_report(lambda: presenter.question(self.workspace.session))
         if values is None or values == self._basis:
             return
         self._basis = values
@@ -136,7 +135,7 @@ class AdviserWindow(ToolWindow):
             table, _, name = key.partition(".")
             number.set_value(values[table][name])
 
-    def values(self) -> advising.Values:
+    def values(self) -> presenter.Values:
         """The request in the fields."""
         flush_fields(self.form)
         values = {table: dict(keys) for table, keys in self._asked.items()}
@@ -167,10 +166,10 @@ class AdviserWindow(ToolWindow):
     def show_advice(self, advice: Advice, files: dict[str, bytes]) -> None:
         """Show an advice, and enable saving of its files."""
         self.advice, self.files = advice, files
-        words = advising.headline(advice)
+        words = presenter.headline(advice)
         self.headline.setText(words)
-        self.place.set_rows(advising.place_rows(advice))
-        self.kept.set_rows(advising.kept_rows(advice))
+        self.place.set_rows(presenter.place_rows(advice))
+        self.kept.set_rows(presenter.kept_rows(advice))
         if advice.possible:
             self.costs.show_table(cost_table(advice))
             bar = self.costs.horizontalScrollBar().sizeHint().height()
@@ -183,8 +182,6 @@ class AdviserWindow(ToolWindow):
 
     def show_state(self) -> None:
         """Enable the actions that are available now."""
-        if not hasattr(self, "start_button"):
-            return
         session, advice = self.workspace.session, self.advice
         writable = session is not None and not session.read_only
         self.start_button.setEnabled(not self.working)
@@ -194,7 +191,7 @@ class AdviserWindow(ToolWindow):
     def use(self) -> None:
         """Use the recommended set-up in the session."""
         advice = self.advice
-        if advice is not None and self.workspace.attempt(lambda s: advising.use(s, advice)):
+        if advice is not None and self.workspace.attempt(lambda s: presenter.use(s, advice)):
             self.workspace.notified.emit(
                 "The advised set-up is applied: calibrate laser and plane in steps 2 and 3", False
             )

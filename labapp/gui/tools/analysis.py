@@ -8,8 +8,8 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QCheckBox, QStackedWidget, QWidget
 
 from labapp.gui.tasks import Control
-from labapp.gui.tools import analysing
-from labapp.gui.tools.analysing import BUDGET, OPENED, PARTS, USUAL
+from labapp.gui.tools import analysis_presenter as presenter
+from labapp.gui.tools.analysis_presenter import BUDGET, OPENED, PARTS, USUAL
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, flush_fields
 from labapp.gui.widgets.labels import wrapping_label
@@ -50,15 +50,6 @@ class AnalysisWindow(ToolWindow):
         self._anew = False
         self._basis: object = None
         super().__init__(sessions, window)
-        self._make_form()
-        self._make_results()
-        self.add_save_button(
-            "Save the results…", "Write all tables (CSV, Markdown) and pictures to a folder"
-        )
-        self.start_button = self.add_button(
-            "Run", "Compute what is ticked; each part is shown when it is done", self.start
-        )
-        self.show_state()
 
     def _make_form(self) -> None:
         self.form.add_heading("What is computed")
@@ -71,7 +62,7 @@ class AnalysisWindow(ToolWindow):
             self.parts[key] = box
             self.form.add_wide(box)
         self.form.add_heading("Of the budget")
-        self.setup = ChoiceField("Set-up", analysing.SETUPS, tooltip="Whose errors are added up")
+        self.setup = ChoiceField("Set-up", presenter.SETUPS, tooltip="Whose errors are added up")
         self.form.add(self.setup)
         self.sizes: dict[str, NumberField] = {}
         for key, label, lowest, highest, step, tip in SIZES:
@@ -81,7 +72,7 @@ class AnalysisWindow(ToolWindow):
             self.form.add(self.sizes[key])
         self.form.add_heading("Of the other parts")
         self.scheme = ChoiceField(
-            "Schemes", analysing.SCHEME_CHOICES, tooltip="By which schemes; the budget is of fit"
+            "Schemes", presenter.SCHEME_CHOICES, tooltip="By which schemes; the budget is of fit"
         )
         self.step = NumberField(
             "LE, ME: step",
@@ -109,8 +100,7 @@ class AnalysisWindow(ToolWindow):
             (self.draws, usual.draws),
         ):
             field.set_value(value)
-        for one in (self.scheme, self.step, self.frames, self.draws):
-            self.form.add(one)
+        self.form.add(self.scheme, self.step, self.frames, self.draws)
 
     def _make_results(self) -> None:
         self.which = ChoiceField("Shown", tooltip="Tables and pictures that are done")
@@ -134,16 +124,24 @@ class AnalysisWindow(ToolWindow):
         self._line = line
         line.hide()
 
+    def _make_buttons(self) -> None:
+        self.add_save_button(
+            "Save the results…", "Write all tables (CSV, Markdown) and pictures to a folder"
+        )
+        self.start_button = self.add_button(
+            "Run", "Compute what is ticked; each part is shown when it is done", self.start
+        )
+
     # --- what is to be worked out --------------------------------------------------------------
 
     def prefill(self) -> None:
         """Fill in pool and set-up of the session if they changed since the last time."""
         session = self.workspace.session
         sizes = (
-            self.workspace.run_or_report(lambda: analysing.expected_mm(session))
-            or analysing.USUAL_MM
+            self.workspace.run_or_report(lambda: presenter.expected_mm(session))
+            or presenter.USUAL_MM
         )
-        basis = (analysing.has_setup(session), sizes)
+        basis = (presenter.has_setup(session), sizes)
         if basis == self._basis:
             return
         self._basis = basis
@@ -197,7 +195,7 @@ class AnalysisWindow(ToolWindow):
         self.pictures |= made.pictures
         self.files |= made.files
         names = (*self.tables, *self.pictures)
-        self.which.set_choices([(name, analysing.result_title(name)) for name in names])
+        self.which.set_choices([(name, presenter.result_title(name)) for name in names])
         self.which.set_value(made.tables[0].name)
         for widget in (self._line, self.stack):
             widget.show()
@@ -211,15 +209,13 @@ class AnalysisWindow(ToolWindow):
             self.table.show_table(self.tables[name])
             self.stack.setCurrentWidget(self.table)
         else:
-            words = analysing.result_title(name)
+            words = presenter.result_title(name)
             self.words.setText(words)
             self.sheet.show_png(self.pictures[name], words)
             self.stack.setCurrentWidget(self.sheet)
 
     def show_state(self) -> None:
         """Enable the actions that are available now."""
-        if not hasattr(self, "start_button"):
-            return
         ticked = any(box.isChecked() for box in self.parts.values())
         self.start_button.setEnabled(ticked and not self.working)
         self.save_button.setEnabled(bool(self.files))

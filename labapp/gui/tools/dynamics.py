@@ -11,7 +11,7 @@ from PySide6.QtGui import QCloseEvent
 from PySide6.QtWidgets import QAbstractItemView, QTabWidget, QWidget
 
 from labapp.gui.tasks import Control
-from labapp.gui.tools import dynamics_shown as shown
+from labapp.gui.tools import dynamics_presenter as presenter
 from labapp.gui.tools.tool import ToolWindow
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
@@ -39,7 +39,7 @@ class DynamicsWindow(ToolWindow):
     title = "Pool over time"
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
-        self.drawn: shown.Drawn | None = None
+        self.drawn: presenter.DrawnDynamics | None = None
         """The displayed analysis; None before the first one."""
         self._of: Overview | None = None
         self._event_frames: tuple[int, ...] = ()
@@ -48,24 +48,18 @@ class DynamicsWindow(ToolWindow):
         self._turn = QTimer(self, interval=FILM_MS)
         self._turn.timeout.connect(self._next_picture)
         self.workspace.opened.connect(self._forget)
-        self._make_form()
-        self._make_results()
-        self.add_save_button("Save the results…", "Write all tables (CSV) and pictures to a folder")
-        self.start_button = self.add_button(
-            "Analyse", "Find oscillations, modes, events and responses", self.start
-        )
-        self.show_state()
 
     def _make_form(self) -> None:
         self.form.add_heading("Spectrum")
-        self.of = ChoiceField("Measure", shown.SERIES, tooltip="Whose spectra and peak are shown")
+        self.of = ChoiceField(
+            "Measure", presenter.SERIES, tooltip="Whose spectra and peak are shown"
+        )
         self.of.set_value("height_mm")
         self.segment = NumberField(
             "Segment", "s", lowest=0.001, highest=1e4, step=0.05, decimals=3, optional=True,
             tooltip="Duration of a segment of the spectrogram; empty: an eighth of the recording",
         )  # fmt: skip
-        self.form.add(self.of)
-        self.form.add(self.segment)
+        self.form.add(self.of, self.segment)
         self.form.add_heading("Oscillations looked for")
         ends = ("From", 0.01, "Lowest"), ("To", 0.01, "Highest")
         self.band = [
@@ -75,8 +69,7 @@ class DynamicsWindow(ToolWindow):
             )
             for name, lowest, end in ends
         ]  # fmt: skip
-        for field in self.band:
-            self.form.add(field)
+        self.form.add(*self.band)
         for field in (self.segment, *self.band):
             field.set_placeholder("automatic")
 
@@ -122,18 +115,28 @@ class DynamicsWindow(ToolWindow):
         self.results.addStretch()
         self.tabs.hide()
 
+    def _make_buttons(self) -> None:
+        self.add_save_button("Save the results…", "Write all tables (CSV) and pictures to a folder")
+        self.start_button = self.add_button(
+            "Analyse", "Find oscillations, modes, events and responses", self.start
+        )
+
     # --- analysing -----------------------------------------------------------------------------
 
     def prefill(self) -> None:
         """Analyse the session's results unless they are already shown."""
-        if not shown.same_results(self.workspace.overview(), self._of):
+        if not presenter.same_results(self._overview(), self._of):
             self.start()
+
+    def _overview(self) -> Overview | None:
+        """Overview of the session; None without a session, and if it is damaged: reported."""
+        return self.workspace.run_or_report(self.workspace.overview)
 
     def start(self) -> None:
         """Analyse the session's results in the background."""
         flush_fields(self.form)
-        session, seen = self.workspace.session, self.workspace.overview()
-        why = shown.impossible(session, seen)
+        session, seen = self.workspace.session, self._overview()
+        why = presenter.impossible(session, seen)
         if why or session is None or seen is None or self.working:
             self.show_state()
             return
@@ -155,36 +158,36 @@ class DynamicsWindow(ToolWindow):
                 yield one
             control.progress(len(seen.frame), len(seen.frame), "analysing")
 
-        def work(control: Control) -> shown.Drawn:
+        def work(control: Control) -> presenter.DrawnDynamics:
             from labapp.export.dynamics import dynamics_of
 
             found = dynamics_of(counted(control), signals, settings)
-            return shown.draw(found, control.check)
+            return presenter.draw(found, control.check)
 
         self._of = seen
         self.begin("Analysing", work, self.show_found)
 
-    def show_found(self, drawn: shown.Drawn) -> None:
+    def show_found(self, drawn: presenter.DrawnDynamics) -> None:
         """Show an analysis."""
         found = drawn.found
         self.drawn = drawn
         self.say("Done")
-        self.peak_words.setText(shown.peak_text(found))
+        self.peak_words.setText(presenter.peak_text(found))
         self.spectrum.show_png(drawn.spectrum, self.peak_words.text())
         self.series.show_png(drawn.series, "Series with their events as lines")
-        self.modes.show_table(shown.modes_table(found))
+        self.modes.show_table(presenter.modes_table(found))
         self.modes.selectRow(self._strongest(found))
-        table, self._event_frames = shown.events_table(found)
+        table, self._event_frames = presenter.events_table(found)
         self.events.show_table(table)
         self.event_words.setVisible(not table.rows)
         for widget in (self.events, self.frame_button):
             widget.setVisible(bool(table.rows))
-        responses = shown.responses_table(found)
+        responses = presenter.responses_table(found)
         self.responses.show_table(responses)
         session = self.workspace.session
         has_signals = session is not None and session.signals is not None
         self.response_words.setText(
-            "" if responses.rows else shown.no_responses(found, has_signals)
+            "" if responses.rows else presenter.no_responses(found, has_signals)
         )
         self.response_words.setVisible(not responses.rows)
         self.responses.setVisible(bool(responses.rows))
@@ -241,13 +244,13 @@ class DynamicsWindow(ToolWindow):
             self._turn.start()
         elif drawn is not None:
             mode = drawn.found.all_modes[row]
-            turns = shown.FILM_TURNS
+            turns = presenter.FILM_TURNS
 
             def work(control: Control) -> list[bytes]:
                 pictures = []
                 for k in range(turns):
                     control.progress(k, turns, "drawing")
-                    pictures.append(shown.mode_picture(drawn.found, mode, k / turns))
+                    pictures.append(presenter.mode_picture(drawn.found, mode, k / turns))
                 return pictures
 
             def done(pictures: list[bytes]) -> None:
@@ -277,13 +280,11 @@ class DynamicsWindow(ToolWindow):
 
     def show_state(self) -> None:
         """Enable the actions that are available now, and show what can be determined."""
-        if not hasattr(self, "start_button"):
-            return
         session = self.workspace.session
-        seen = self.workspace.overview() if session is not None else None
-        why = shown.impossible(session, seen)
-        text = why or (shown.range_text(seen) if seen is not None else "")
-        if self.drawn is not None and not shown.same_results(seen, self._of):
+        seen = self._overview()
+        why = presenter.impossible(session, seen)
+        text = why or (presenter.range_text(seen) if seen is not None else "")
+        if self.drawn is not None and not presenter.same_results(seen, self._of):
             text = f"{CHANGED} {text}"
         self.words.setText(text)
         idle = not self.working

@@ -14,8 +14,8 @@ from PySide6.QtWidgets import QWidget
 from labapp.config.scenario import Scenario, read_scenario
 from labapp.gui.dialogs import ask_file, ask_folder, new_path
 from labapp.gui.tasks import Control, Tasks
-from labapp.gui.tools import simulating
-from labapp.gui.tools.simulating import ScenarioPreview
+from labapp.gui.tools import simulator_presenter as presenter
+from labapp.gui.tools.simulator_presenter import ScenarioPreview
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
@@ -50,22 +50,11 @@ class SimulatorWindow(ToolWindow):
         self._sessions = sessions
         self._preferences = sessions.preferences
         self.previews = Tasks(self)
-        self._make_form()
-        self._make_results()
         self.previews.failed.connect(lambda _, why: self._show_refusal(why))
-        self.open_button = self.add_button(
-            "Open as a new session",
-            "Make a session of the recording that was written, with its set-up, and open it",
-            self.open_session,
-        )
-        self.start_button = self.add_button(
-            "Simulate", "Write recording and truth to the folder", self.start
-        )
-        self.show_state()
 
     def _make_form(self) -> None:
         self.scenario = ChoiceField(
-            "Scenario", simulating.choices(None), tooltip="The pool, the bench and the camera"
+            "Scenario", presenter.choices(None), tooltip="The pool, the bench and the camera"
         )
         self.scenario.edited.connect(lambda _: self.show_scenario())
         self.words = wrapping_label()
@@ -91,8 +80,7 @@ class SimulatorWindow(ToolWindow):
         self.add_to_form(
             "Load scenario…", "Load a scenario of your own (TOML)", self.choose_scenario
         )
-        for field in (self.frames, self.seed, self.folder):
-            self.form.add(field)
+        self.form.add(self.frames, self.seed, self.folder)
         self.add_to_form(
             "Choose folder…", "The simulation goes into a new one in it", self.choose_folder
         )
@@ -106,6 +94,16 @@ class SimulatorWindow(ToolWindow):
         )
         self.picture.add(self._rings)
         self.results.addWidget(self.picture)
+
+    def _make_buttons(self) -> None:
+        self.open_button = self.add_button(
+            "Open as a new session",
+            "Make a session of the recording that was written, with its set-up, and open it",
+            self.open_session,
+        )
+        self.start_button = self.add_button(
+            "Simulate", "Write recording and truth to the folder", self.start
+        )
 
     # --- what is to be simulated ---------------------------------------------------------------
 
@@ -125,7 +123,7 @@ class SimulatorWindow(ToolWindow):
     def take(self, path: Path) -> None:
         """Choose the operator's own scenario."""
         self._own = path
-        self.scenario.set_choices(simulating.choices(path))
+        self.scenario.set_choices(presenter.choices(path))
         self.scenario.set_value(str(path))
         self.show_scenario()
 
@@ -161,7 +159,7 @@ class SimulatorWindow(ToolWindow):
         def work(control: Control) -> ScenarioPreview:
             with self._turn:
                 control.check()
-                found = simulating.preview(Path(path), seed)
+                found = presenter.preview(Path(path), seed)
                 control.check()
             return found
 
@@ -190,15 +188,14 @@ class SimulatorWindow(ToolWindow):
 
     def _show_rows(self) -> None:
         frames = int(self.frames.value() or 1)
-        self.table.set_rows(() if self.preview is None else simulating.rows(self.preview, frames))
+        self.table.set_rows(() if self.preview is None else presenter.rows(self.preview, frames))
 
     # --- writing, opening ----------------------------------------------------------------------
 
     def show_state(self) -> None:
         """Enable the actions that are available now."""
-        if hasattr(self, "start_button"):
-            self.start_button.setEnabled(not self.working and self.preview is not None)
-            self.open_button.setEnabled(not self.working and self.made is not None)
+        self.start_button.setEnabled(not self.working and self.preview is not None)
+        self.open_button.setEnabled(not self.working and self.made is not None)
 
     def start(self) -> None:
         """Write recording and true values in the background; the folder is complete or absent."""

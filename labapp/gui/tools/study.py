@@ -14,7 +14,7 @@ from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QHeaderView, QTabWid
 
 from labapp.gui.dialogs import SETUP_FILES, ask_file, ask_folder, ask_save, dropped_paths
 from labapp.gui.tasks import Control, Tasks
-from labapp.gui.tools import studying
+from labapp.gui.tools import study_presenter as presenter
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.widgets.fields import (
     ChoiceField,
@@ -31,7 +31,7 @@ from labapp.gui.widgets.tables import CellTable, FittingTable
 from labapp.run.measurers import measuring_pool
 from labapp.run.study.page import condition_picture, varying_conditions
 from labapp.run.study.plan import StudyRecording, folder_pattern, write_study
-from labapp.run.study.status import Progress, RecordingStatus, count_states
+from labapp.run.study.status import RecordingStatus, StudyProgress, count_states
 from labapp.run.study.study import Study, require_extra
 from labapp.run.study.summary import StudySummary
 from labapp.simulation.parallel import end_processes, wait_for
@@ -74,21 +74,6 @@ class StudyWindow(ToolWindow):
         self.looks.changed.connect(self._show)
         self.tasks.changed.connect(self._look_at_end)
         self.setAcceptDrops(True)
-        self._make_form()
-        self._make_results()
-        self.page_button = self.add_button(
-            "Show the summary",
-            "Show tables and plots in the browser (summary.html)",
-            self.show_page,
-        )
-        self.open_button = self.add_button(
-            "Open in a session",
-            "Show the frames and surfaces of the selected recording in the main window",
-            self.open_selected,
-        )
-        self.start_button = self.add_button(
-            "Run", "Measure what is not measured yet; it can be stopped at any moment", self.start
-        )
         self._show()
 
     def _make_form(self) -> None:
@@ -128,8 +113,7 @@ class StudyWindow(ToolWindow):
         self.surfaces.setToolTip(
             "Write surfaces.zarr, too: what was measured without is measured again"
         )
-        self.form.add(self.workers)
-        self.form.add(self.scheduler)
+        self.form.add(self.workers, self.scheduler)
         self.form.add_wide(self.surfaces)
 
     def _make_results(self) -> None:
@@ -162,6 +146,21 @@ class StudyWindow(ToolWindow):
         self.results.addWidget(self.words)
         self.results.addWidget(self.tabs, 1)
 
+    def _make_buttons(self) -> None:
+        self.page_button = self.add_button(
+            "Show the summary",
+            "Show tables and plots in the browser (summary.html)",
+            self.show_page,
+        )
+        self.open_button = self.add_button(
+            "Open in a session",
+            "Show the frames and surfaces of the selected recording in the main window",
+            self.open_selected,
+        )
+        self.start_button = self.add_button(
+            "Run", "Measure what is not measured yet; it can be stopped at any moment", self.start
+        )
+
     # --- which study ---------------------------------------------------------------------------
 
     def choose(self) -> None:
@@ -189,7 +188,7 @@ class StudyWindow(ToolWindow):
             elif path.suffix.lower() not in (".toml", ".csv"):
                 self.recordings.set_value(str(path))
                 self._show_matches()
-            elif studying.is_setup(path):
+            elif presenter.is_setup(path):
                 self.setup.set_value(str(path))
             else:
                 self.show_study(path)
@@ -206,7 +205,7 @@ class StudyWindow(ToolWindow):
             self.setup.set_value(str(beside[0]))
 
     def _show_matches(self) -> None:
-        show_words(self.matches, studying.matches_text(self.recordings.value().strip()))
+        show_words(self.matches, presenter.matches_text(self.recordings.value().strip()))
 
     def choose_setup(self) -> None:
         """Ask for a setup file."""
@@ -296,7 +295,7 @@ class StudyWindow(ToolWindow):
             reading = ". Reading the results…" * bool(self.looks.active)
             self.words.setText(f"{plan.title}: {count_states(self.found)}{reading}")
             chosen = self.list.currentRow() if self.list.selectedItems() else -1
-            self.list.show_table(studying.recordings_table(plan, self.found))
+            self.list.show_table(presenter.recordings_table(plan, self.found))
             if chosen >= 0:
                 self.list.selectRow(chosen)
             header = self.list.horizontalHeader()
@@ -304,8 +303,8 @@ class StudyWindow(ToolWindow):
             # The reason of a failure, wrapped to as many lines as needed.
             header.setSectionResizeMode(header.count() - 1, QHeaderView.ResizeMode.Stretch)
         if self.summary is not None:
-            self.means.show_table(studying.means_table(self.summary))
-            self.outliers.show_table(studying.outliers_table(self.summary))
+            self.means.show_table(presenter.means_table(self.summary))
+            self.outliers.show_table(presenter.outliers_table(self.summary))
         for place in range(1, self.tabs.count()):
             self.tabs.setTabEnabled(place, self.summary is not None)
         self.show_state()
@@ -344,7 +343,7 @@ class StudyWindow(ToolWindow):
             require_extra()
             looked_s = took_s = 0.0
 
-            def progress(now: Progress) -> None:
+            def progress(now: StudyProgress) -> None:
                 nonlocal looked_s, took_s
                 words = f"{now.recordings_done} of {now.recordings} recordings"
                 control.progress(now.frames_done, now.frames, words)
@@ -386,7 +385,7 @@ class StudyWindow(ToolWindow):
         recording, frame = chosen
 
         def work(control: Control) -> Path:
-            return studying.begin_session(study.folder, recording, progress_of(control))
+            return presenter.begin_session(study.folder, recording, progress_of(control))
 
         def opened(path: Path) -> None:
             if self._sessions.open(path):
@@ -408,10 +407,9 @@ class StudyWindow(ToolWindow):
 
     def show_state(self) -> None:
         """Enable the actions that are available now."""
-        if hasattr(self, "start_button"):
-            self.start_button.setEnabled(self.study is not None and not self.working)
-            self.open_button.setEnabled(self.selected() is not None and not self.working)
-            self.page_button.setEnabled(self.summary is not None)
+        self.start_button.setEnabled(self.study is not None and not self.working)
+        self.open_button.setEnabled(self.selected() is not None and not self.working)
+        self.page_button.setEnabled(self.summary is not None)
 
 
 def _results(path: Path, folder: Path, surfaces: bool) -> StudySummary:

@@ -71,6 +71,9 @@ class ToolWindow(QDialog):
             "Close", "Close this window and stop its work; what it found is kept", self.close
         )
         self._lay_out(scrolled(found))  # on a small screen
+        self._make_form()
+        self._make_results()
+        self._make_buttons()
         for signal in (self.tasks.changed, self.tasks.progressed):
             signal.connect(self._show_progress)
         self.tasks.failed.connect(lambda _, why: self.say(why, True))
@@ -107,6 +110,15 @@ class ToolWindow(QDialog):
         self.form.add_wide(button(words, tip, do))
 
     # --- what tools say for themselves ---------------------------------------------------------
+
+    def _make_form(self) -> None:
+        """Add the fields to `form`."""
+
+    def _make_results(self) -> None:
+        """Add the widgets to `results`."""
+
+    def _make_buttons(self) -> None:
+        """Add the tool's own buttons, the first one last."""
 
     def prefill(self) -> None:
         """Fill in values of the session that changed since the last time."""

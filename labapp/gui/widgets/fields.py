@@ -419,21 +419,22 @@ class FieldForm(QWidget):
         self._grid.setColumnStretch(1, 3)
         self._fields: list[Field] = []
 
-    def add(self, field: Field, beside: Field | None = None) -> None:
-        """Put a field below the others, and perhaps one without label and unit beside it."""
-        row = self._grid.rowCount()
-        self._grid.addWidget(field.label, row, 0, Qt.AlignmentFlag.AlignTop)
-        self._grid.addWidget(field, row, 1)
+    def add(self, *fields: Field, beside: Field | None = None) -> None:
+        """Put fields below the others, and perhaps one without label and unit beside the last."""
+        for field in fields:
+            row = self._grid.rowCount()
+            self._grid.addWidget(field.label, row, 0, Qt.AlignmentFlag.AlignTop)
+            self._grid.addWidget(field, row, 1)
+            # Aligned with the editor's first line.
+            height = field.editor.fontMetrics().lineSpacing() + 12
+            field.label.setMinimumHeight(min(field.editor.sizeHint().height(), height))
+            self._fields.append(field)
         if beside is not None:
             beside.unit.hide()
             digits = beside.editor.fontMetrics().horizontalAdvance("0.0000")
             beside.editor.setMinimumWidth(digits + BUTTONS_PX)
-            self._grid.addWidget(beside, row, 2, Qt.AlignmentFlag.AlignTop)
+            self._grid.addWidget(beside, self._grid.rowCount() - 1, 2, Qt.AlignmentFlag.AlignTop)
             self._grid.setColumnStretch(2, 1)
-        # Aligned with the editor's first line.
-        height = field.editor.fontMetrics().lineSpacing() + 12
-        field.label.setMinimumHeight(min(field.editor.sizeHint().height(), height))
-        self._fields.append(field)
         units = [other.unit for other in self._fields if other.unit.text()]
         width = max((unit.sizeHint().width() for unit in units), default=0)
         for unit in units:

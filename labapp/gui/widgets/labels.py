@@ -5,7 +5,7 @@ from __future__ import annotations
 from PySide6 import QtGui
 from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QPainter, QPaintEvent, QResizeEvent, QTextLayout, QTextOption
-from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
+from PySide6.QtWidgets import QLabel, QListWidgetItem, QSizePolicy, QTableWidgetItem, QWidget
 
 
 def plain_label(text: str = "", parent: QWidget | None = None) -> QLabel:
@@ -38,10 +38,19 @@ def allow(widget: QWidget, tip: str, why_not: str) -> None:
 def heading(text: str) -> QLabel:
     """A heading above a group of widgets, in bold."""
     label = wrapping_label(text)
-    font = label.font()
-    font.setBold(True)
-    label.setFont(font)
+    set_font(label)
     return label
+
+
+def set_font(
+    part: QWidget | QListWidgetItem | QTableWidgetItem, *, bold: bool = True, scale: float = 1.0
+) -> None:
+    """Make the text of a widget or an item bold or not, and its size larger by a factor."""
+    font = part.font()
+    font.setBold(bold)
+    if scale != 1:  # otherwise it would no longer follow the size of the window's text
+        font.setPointSizeF(scale * font.pointSizeF())
+    part.setFont(font)
 
 
 def selectable_label(text: str = "") -> QLabel:

@@ -25,10 +25,10 @@ from labapp.media.devices.hid import (
 )
 from labapp.media.events import OnEvent, ignore_event
 
-Action = Literal["trigger", "mark", "next"]
+PedalAction = Literal["trigger", "mark", "next"]
 """Trigger a recording, mark the frame, or go to the next step."""
 
-ACTIONS: tuple[Action, ...] = ("trigger", "mark", "next")
+ACTIONS: tuple[PedalAction, ...] = ("trigger", "mark", "next")
 
 BOUNCE_S = 0.05
 """Time for debouncing: a pedal pressed again within it counts once, s."""
@@ -49,10 +49,10 @@ class PedalMap:
     name: str
     keyboard: bool
     """Whether it sends keys."""
-    actions: Mapping[int, Action] = field(default_factory=dict)
+    actions: Mapping[int, PedalAction] = field(default_factory=dict)
     """Number of a pedal → its action."""
 
-    def with_action(self, pedal: int, action: Action | None) -> PedalMap:
+    def with_action(self, pedal: int, action: PedalAction | None) -> PedalMap:
         """Return a copy with another action of a pedal; None: no action."""
         actions = {key: value for key, value in self.actions.items() if key != pedal}
         if action is not None:
@@ -93,7 +93,7 @@ class Learned:
     info: HidInfo
     pedal: int
 
-    def mapped(self, action: Action) -> PedalMap:
+    def mapped(self, action: PedalAction) -> PedalMap:
         """Return a foot switch with an action of this pedal."""
         info = self.info
         return PedalMap(info.key, info.name, info.is_keyboard, {self.pedal: action})
@@ -162,7 +162,7 @@ class FootSwitch(HidReader):
     def __init__(
         self,
         pedals: PedalMap,
-        on_action: Callable[[Action], None],
+        on_action: Callable[[PedalAction], None],
         on_event: OnEvent = ignore_event,
         find: Find = find_hid,
         opener: Open = open_hid,

@@ -8,13 +8,11 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from matplotlib import rc_context
-
 from labapp.core.surface.measures import SIZES
 from labapp.run.study.plan import Condition, named_condition, shown_condition
 from labapp.run.study.status import STATE_WORDS, count_states
 from labapp.run.study.summary import GroupSummary, Mean, StudySummary
-from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure
+from labapp.studies.plotting import INCHES, as_bytes, new_figure
 from labapp.text import SIGMA_OF, axis_label, column_heading, with_sigma
 
 MOST_SHOWN = 60
@@ -122,8 +120,7 @@ def condition_picture(summary: StudySummary, condition: str) -> bytes:
         One of `varying_conditions`; empty: none, all recordings at one position.
     """
     others = [name for name in varying_conditions(summary) if name != condition]
-    with rc_context(STYLE):
-        figure = new_figure(INCHES, 3.8)
+    with new_figure(INCHES, 3.8) as figure:
         axes = figure.subplots(2, 3, sharex=True).flatten()
         _draw_row(axes, summary, condition, others)
         for axis, size in zip(axes, SIZES, strict=True):
@@ -135,8 +132,7 @@ def _plots(summary: StudySummary) -> str:
     """Plot small multiples: one row per varying condition, one column per size."""
     varying = varying_conditions(summary)[:MOST_ROWS] or [""]
     width, height = PANEL_INCHES
-    with rc_context(STYLE):
-        figure = new_figure(width * len(SIZES) + 1.2, height * len(varying) + 0.3)
+    with new_figure(width * len(SIZES) + 1.2, height * len(varying) + 0.3) as figure:
         shape = len(varying), len(SIZES)
         axes = figure.subplots(*shape, squeeze=False, sharex="row", sharey="col")
         for row, condition in enumerate(varying):

@@ -46,7 +46,7 @@ def count_states(found: Iterable[RecordingStatus]) -> str:
 
 
 @dataclass(frozen=True)
-class Progress:
+class StudyProgress:
     """Progress of a run."""
 
     frames_done: int

@@ -17,7 +17,7 @@ from labapp.errors import PATH, InputError, os_errors_as_input, require
 from labapp.files import as_bytes, write_file
 from labapp.run.runner import select_frames
 from labapp.run.study.plan import StudyPlan, StudyRecording, read_study
-from labapp.run.study.status import Progress, RecordingStatus, State, Tasks
+from labapp.run.study.status import RecordingStatus, State, StudyProgress, Tasks
 from labapp.run.study.stretches import (
     CannotStore,
     found_recording,
@@ -97,7 +97,7 @@ class Study:
         scheduler: str | None = None,
         *,
         surfaces: bool = False,
-        progress: Callable[[Progress], object] = lambda _: None,
+        progress: Callable[[StudyProgress], object] = lambda _: None,
         note: Callable[[str], object] = lambda _: None,
     ) -> list[RecordingStatus]:
         """Measure the frames that are not measured yet; can be repeated after any interruption.
@@ -343,7 +343,7 @@ class _Run:
         self,
         study: Study,
         surfaces: bool,
-        progress: Callable[[Progress], object],
+        progress: Callable[[StudyProgress], object],
         note: Callable[[str], object],
     ) -> None:
         self._study, self._surfaces, self._note = study, surfaces, note
@@ -421,7 +421,7 @@ class _Run:
         unseen = count - seen - len(self._failed - set(self._frames))
         estimated = known + (round(known / seen * unseen) if seen else 0)
         done = sum(left == 0 for left in self._left.values())
-        self._progress(Progress(self._done, estimated, done, count, len(self._failed)))
+        self._progress(StudyProgress(self._done, estimated, done, count, len(self._failed)))
 
 
 def _fault(error: Exception) -> str:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.patches import Polygon
 
 from labapp.core.geometry.optics import (
@@ -23,7 +22,7 @@ from labapp.core.values import FloatArray
 from labapp.export.meshes import drawn_spacing
 from labapp.media import GreyImage
 from labapp.session.report.layout import DPI
-from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure, row_colour
+from labapp.studies.plotting import INCHES, as_bytes, new_figure, row_colour
 
 STATES = {
     "measured": {"marker": "o", "color": "#1b4f8a", "markerfacecolor": "#1b4f8a"},
@@ -52,8 +51,7 @@ def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
     fan = ray_directions(rig.laser, rig.pattern)[[0, (rig.pattern.rows - 1) // 2, -1], middle]
     low, high = min(plane.origin_mm[1], top[1]) - 8, laser[1] + 12
     floor, roof = -9.0, max(top[2], laser[2], 3 * rig.electrode.height_mm) + 7
-    with rc_context(STYLE):
-        figure = new_figure(INCHES, min(INCHES * (roof - floor) / (high - low) + 0.45, 4.5))
+    with new_figure(INCHES, min(INCHES * (roof - floor) / (high - low) + 0.45, 4.5)) as figure:
         view = figure.subplots()
         view.axhspan(floor, 0, color="0.9", lw=0)
         view.axhline(0, color="0.3", lw=0.8)
@@ -121,8 +119,7 @@ def target_picture(image: GreyImage, points_px: Sequence[Sequence[float]]) -> by
     margin = 0.2 * np.ptp(corners, axis=0).max()
     box = np.clip([low - margin, high + margin], -0.5, np.array(image.shape[::-1]) - 0.5)
     wide, tall = box[1] - box[0]
-    with rc_context(STYLE):
-        figure = new_figure(INCHES * 0.85, float(np.clip(INCHES * 0.8 * tall / wide, 1.5, 4.5)))
+    with new_figure(INCHES * 0.85, float(np.clip(INCHES * 0.8 * tall / wide, 1.5, 4.5))) as figure:
         view = figure.subplots()
         view.imshow(image, cmap="gray", interpolation="antialiased")
         for name, end, tip, colour in zip(
@@ -157,8 +154,7 @@ def trends(axis: FloatArray, label: str, series: list[Series], states: list[str]
     states
         State of each frame; frames with states other than `STATES` are not drawn.
     """
-    with rc_context(STYLE):
-        figure = new_figure(INCHES, 1.2 * len(series) + 0.4)
+    with new_figure(INCHES, 1.2 * len(series) + 0.4) as figure:
         plots = figure.subplots(len(series), sharex=True, squeeze=False)[:, 0]
         for plot, one in zip(plots, series, strict=True):
             _draw_trend(plot, axis, one, states)
@@ -207,8 +203,7 @@ def dots_picture(image: GreyImage | None, measurement: Measurement) -> bytes:
     u, v = dots.image_px.T
     box = (u.min() - 45, u.max() + 25, v.max() + 18, v.min() - 22)
     tall = INCHES * (box[2] - box[3]) / (box[1] - box[0])
-    with rc_context(STYLE):
-        figure = new_figure(INCHES, float(np.clip(tall + 0.3, 1.5, 5.0)))
+    with new_figure(INCHES, float(np.clip(tall + 0.3, 1.5, 5.0))) as figure:
         view = figure.subplots()
         if image is not None:
             low, high = np.percentile(image, [1, 99.8])
@@ -241,10 +236,9 @@ def height_map(measurement: Measurement) -> bytes:
     triangles = triangles[np.isfinite(vertices[triangles]).all(axis=(1, 2))]
     x, y, z = np.nan_to_num(vertices).T
     outline = np.vstack([found.boundary.points_mm, found.boundary.points_mm[:1]])
-    with rc_context(STYLE):
-        wide = INCHES * 0.55
-        ratio = np.ptp(outline[:, 1]) / np.ptp(outline[:, 0])
-        figure = new_figure(wide, float(np.clip((wide - 1.1) * ratio + 0.5, 2.0, 3.3)))
+    wide = INCHES * 0.55
+    ratio = np.ptp(outline[:, 1]) / np.ptp(outline[:, 0])
+    with new_figure(wide, float(np.clip((wide - 1.1) * ratio + 0.5, 2.0, 3.3))) as figure:
         view = figure.subplots()
         flat = np.ptp(z) < 1e-6
         levels = [z.min() - 1e-3, z.max() + 1e-3] if flat else 14
@@ -269,9 +263,8 @@ def dots_compared(measurement: Measurement) -> bytes:
     known = np.array([ray in captured for ray in rays], bool)
     seen = np.array([captured[ray] for ray in rays if ray in captured]).reshape(-1, 2)
     computed = seen + found.residual_mm[known]
-    with rc_context(STYLE):
-        tall = 1.0 if not len(seen) else np.ptp(seen[:, 1]) / max(np.ptp(seen[:, 0]), 1e-9)
-        figure = new_figure(INCHES * 0.8, float(np.clip(INCHES * 0.8 * tall + 0.6, 1.6, 5.0)))
+    tall = 1.0 if not len(seen) else np.ptp(seen[:, 1]) / max(np.ptp(seen[:, 0]), 1e-9)
+    with new_figure(INCHES * 0.8, float(np.clip(INCHES * 0.8 * tall + 0.6, 1.6, 5.0))) as figure:
         view = figure.subplots()
         view.plot(*seen.T, "o", ms=5, mfc="none", mec="k", mew=0.7, label="captured")
         view.plot(*computed.T, "x", ms=4, color="#c01030", mew=0.8, label="computed")
@@ -282,8 +275,7 @@ def dots_compared(measurement: Measurement) -> bytes:
 
 def positions(axis: FloatArray, label: str, places: Mapping[str, FloatArray]) -> bytes:
     """Plot the pool's centre and peak over time, X above Y (Fig. 7-15)."""
-    with rc_context(STYLE):
-        figure = new_figure(INCHES, 2.3)
+    with new_figure(INCHES, 2.3) as figure:
         plots = figure.subplots(2, sharex=True)
         for (name, place), look in zip(places.items(), ("k+-", "r^-"), strict=True):
             for plot, values in zip(plots, place.T, strict=True):

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from labapp.simulation.forward import trace
 from labapp.studies.adviser.bench_limits import CONSTRAINTS
 from labapp.studies.adviser.search import MOVED, Advice, Candidate, constraint_text
-from labapp.studies.plotting import INCHES, STYLE, new_figure
+from labapp.studies.plotting import INCHES, new_figure
 from labapp.studies.tables import Cell, Table
 
 WORDS = {
@@ -148,8 +147,7 @@ def cost_table(advice: Advice) -> Table:
 
 def advice_picture(advice: Advice) -> Figure:
     """Draw the bench from the side, the possible laser positions and the cost of deviations."""
-    with rc_context(STYLE):
-        figure = new_figure(INCHES, INCHES * 1.15)
+    with new_figure(INCHES, INCHES * 1.15) as figure:
         plots = figure.subplot_mosaic(
             [["side"] * 6, ["map"] * 2 + ["a"] * 2 + ["b"] * 2, ["c"] * 2 + ["d"] * 2 + ["e"] * 2],
             height_ratios=[1.4, 1, 1],

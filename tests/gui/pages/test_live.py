@@ -178,7 +178,7 @@ def test_closing_while_opening_leaves_no_camera_open(live: Live):
 def test_new_plan_applies_to_the_next_recording(live: Live):
     live.open(SimulatedDevice("test", numbered).open)
     live.set_plan(Plan(before_s=0, after_s=0.1, every=3))
-    assert live.ring() == (0.0, "nothing before the trigger")
+    assert live.before_trigger() == (0.0, "nothing before the trigger")
     live.trigger()
     wait_until(live.takes[0].finished.is_set)
     with open_source(live.takes[0].path) as video:
@@ -189,13 +189,13 @@ def test_new_plan_applies_to_the_next_recording(live: Live):
 
 def test_plan_set_while_recording_applies_to_the_next_one(live: Live):
     live.open(SimulatedDevice("test", numbered).open)
-    wait_until(lambda: live.ring()[0] > 0.9)
+    wait_until(lambda: live.before_trigger()[0] > 0.9)
     live.trigger()
     live.set_plan(Plan(before_s=0, after_s=0.1, every=3))
-    assert live.ring() == (0.0, "0.0 of 0.2 s")
+    assert live.before_trigger() == (0.0, "0.0 of 0.2 s")
     wait_until(lambda: live.takes[0].frames > 60)
     live.trigger()
-    wait_until(lambda: live.ring() == (0.0, "nothing before the trigger"))
+    wait_until(lambda: live.before_trigger() == (0.0, "nothing before the trigger"))
     live.trigger()
     wait_until(live.takes[1].finished.is_set)
     steps = []
@@ -209,10 +209,10 @@ def test_ring_buffer_is_empty_after_a_trigger(live: Live):
     device = SimulatedDevice("test", numbered)
     live.set_plan(Plan(before_s=0.5, after_s=0.1))
     live.open(device.open)
-    wait_until(lambda: live.ring()[0] > 0.9)
+    wait_until(lambda: live.before_trigger()[0] > 0.9)
     device.unplug()
     live.trigger()
-    assert live.ring() == (0.0, "0.0 of 0.5 s")
+    assert live.before_trigger() == (0.0, "0.0 of 0.5 s")
 
 
 def test_frames_are_measured_if_the_setup_is_complete(live: Live):

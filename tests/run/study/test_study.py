@@ -199,7 +199,7 @@ def test_files_are_equal_for_any_number_of_processes(measured_file: Path, tmp_pa
 def test_stopped_run_continues_where_it_stopped(study_file: Path) -> None:
     study = Study(study_file)
 
-    def stop(progress: study_module.Progress) -> None:
+    def stop(progress: study_module.StudyProgress) -> None:
         if progress.frames_done >= 3:
             raise KeyboardInterrupt
 

@@ -73,8 +73,7 @@ class MirrorForm(FieldForm):
             optional=True,
         )
         self.level.edited.connect(lambda value: change(replace(selected(), level_sigma_deg=value)))
-        for field in self.fields:
-            self.add(field)
+        self.add(*self.fields)
 
     @property
     def fields(self) -> tuple[ChoiceField | NumberField, ...]:

@@ -27,7 +27,14 @@ from labapp.gui.tasks import Control
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField
-from labapp.gui.widgets.labels import Message, allow, heading, show_words, wrapping_label
+from labapp.gui.widgets.labels import (
+    Message,
+    allow,
+    heading,
+    set_font,
+    show_words,
+    wrapping_label,
+)
 from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.tables import FullTable, ReadTable
 from labapp.gui.workspace import Workspace
@@ -440,9 +447,7 @@ class _QuantityTable(ReadTable):
 
     def _add_heading(self, words: str) -> None:
         item = QTableWidgetItem(words)
-        font = item.font()
-        font.setBold(True)
-        item.setFont(font)
+        set_font(item)
         at = self.rowCount()
         self.setRowCount(at + 1)
         self.setItem(at, 0, item)

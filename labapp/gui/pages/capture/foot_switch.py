@@ -13,7 +13,7 @@ from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
 from labapp.gui.widgets.labels import selectable_label, show_words
 from labapp.gui.widgets.layouts import Group, fill, hbox, vbox
-from labapp.media.devices.foot_switch import Action
+from labapp.media.devices.foot_switch import PedalAction
 from labapp.media.devices.hid import commands
 
 NOTHING = "nothing"
@@ -158,10 +158,10 @@ class FootSwitchPanel(Group):
         (self.switches.give_up if self.switches.learns else self.switches.learn)()
 
     def _use(self) -> None:
-        self.switches.use_learned(cast(Action, self.action.value()))
+        self.switches.use_learned(cast(PedalAction, self.action.value()))
 
     def _assign(self, key: str, pedal: int, chosen: str) -> None:
-        action = None if chosen == NOTHING else cast(Action, chosen)
+        action = None if chosen == NOTHING else cast(PedalAction, chosen)
         self.switches.assign(key, pedal, action)
 
     def _copy(self) -> None:

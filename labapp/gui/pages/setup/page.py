@@ -225,7 +225,7 @@ class SetupPage(Page):
             for entry in entries:
                 field = self.rig_fields[entry.key] = self._put_field(entry)
                 sigma = presenter.sigma_entry(entry)
-                form.add(field, None if sigma is None else self._sigma_field(sigma))
+                form.add(field, beside=None if sigma is None else self._sigma_field(sigma))
             if title == "Torch":
                 tip = "Where the pool's head is: +Y is the laser's side. The rear may lie lower"
                 self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)

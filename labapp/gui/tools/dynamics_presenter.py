@@ -10,7 +10,9 @@ import numpy as np
 
 from labapp.core.dynamics.oscillation import FEWEST
 from labapp.core.surface.measures import WITH_SIGMA
+from labapp.gui.curves import titled
 from labapp.gui.digits import with_sigma
+from labapp.gui.pages.trends.presenter import SIGNALS
 from labapp.session.results.trends import BY_KEY
 from labapp.studies.tables import Table
 from labapp.text import pluralize
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnDynamics:
     """An analysis with its pictures (PNG)."""
 
     found: Dynamics
@@ -56,8 +58,10 @@ NO_STEPS = (
 
 def impossible(session: Session | None, seen: Overview | None) -> str:
     """Reason why a session's dynamics cannot be determined; empty if they can."""
-    if session is None or seen is None:
+    if session is None:
         return "No session is open."
+    if seen is None:
+        return "The results of the session cannot be read."
     if session.has_lines:
         return "The session is of a line pattern, which has no surface to analyse over time."
     if not np.isfinite(seen.time_s).all():
@@ -176,34 +180,30 @@ def no_responses(found: Dynamics, signals: bool) -> str:
 
 def series_label(name: str) -> str:
     """Label of a series or signal with its unit."""
-    if name in BY_KEY:
-        quantity = BY_KEY[name]
-        return f"{quantity.label} ({quantity.unit})" if quantity.unit else quantity.label
-    return {"current": "Current (A)", "voltage": "Voltage (V)", "wire": "Wire feed (m/min)"}[name]
+    if name in SIGNALS:
+        return titled(*SIGNALS[name])
+    return titled(BY_KEY[name].label, BY_KEY[name].unit)
 
 
 # --- pictures ---------------------------------------------------------------------------------
 
 
-def draw(found: Dynamics, check: Callable[[], None]) -> Drawn:
+def draw(found: Dynamics, check: Callable[[], None]) -> DrawnDynamics:
     """Draw an analysis; ``check`` is called in between and may raise to stop."""
     modes = []
     for one in found.all_modes:
         check()
         modes.append(mode_picture(found, one))
     check()
-    return Drawn(found, spectrum_picture(found), series_picture(found), tuple(modes))
+    return DrawnDynamics(found, spectrum_picture(found), series_picture(found), tuple(modes))
 
 
 def spectrum_picture(found: Dynamics) -> bytes:
     """Spectrogram with the tracked peak, and the mean spectrum."""
-    from matplotlib import rc_context
-
     from labapp.export.dynamics import draw_spectrogram, draw_spectrum
-    from labapp.studies.plotting import STYLE, as_bytes, new_figure
+    from labapp.studies.plotting import as_bytes, new_figure
 
-    with rc_context(STYLE):
-        figure = new_figure(WIDE, HIGH)
+    with new_figure(WIDE, HIGH) as figure:
         above, below = figure.subplots(2, 1)
         draw_spectrogram(above, found)
         draw_spectrum(below, found)
@@ -212,14 +212,11 @@ def spectrum_picture(found: Dynamics) -> bytes:
 
 def series_picture(found: Dynamics) -> bytes:
     """Series with their events, steps of signals and responses."""
-    from matplotlib import rc_context
-
     from labapp.core.dynamics.analysis import RESPONDING
     from labapp.export.dynamics import draw_series
-    from labapp.studies.plotting import STYLE, as_bytes, new_figure
+    from labapp.studies.plotting import as_bytes, new_figure
 
-    with rc_context(STYLE):
-        figure = new_figure(WIDE, HIGH)
+    with new_figure(WIDE, HIGH) as figure:
         plots = figure.subplots(len(RESPONDING), 1, sharex=True)
         for plot, name in zip(plots, RESPONDING, strict=True):
             draw_series(plot, found, name)
@@ -230,13 +227,10 @@ def series_picture(found: Dynamics) -> bytes:
 
 def mode_picture(found: Dynamics, one: ModeCourse, turn: float = 0.0) -> bytes:
     """A mode from above at a phase of its period, and its coefficients over time."""
-    from matplotlib import rc_context
-
     from labapp.export.dynamics import draw_mode
-    from labapp.studies.plotting import STYLE, as_bytes, new_figure
+    from labapp.studies.plotting import as_bytes, new_figure
 
-    with rc_context(STYLE):
-        figure = new_figure(WIDE, 2.2)
+    with new_figure(WIDE, 2.2) as figure:
         shape, course = figure.subplots(1, 2, width_ratios=(2, 3))
         draw_mode(shape, found, one, turn)
         labels = ("cos", "sin") if len(one.shape) > 1 else (None,)

@@ -21,7 +21,7 @@ ABOUT = 0.1
 """Relative range of pool sizes around that of the session."""
 
 Values = dict[str, dict[str, Any]]
-"""Table → key → value, as required by `advice_keys.parse_request`."""
+"""Table → key → value, as required by `studies.adviser.keys.parse_request`."""
 
 
 def question(session: Session | None) -> Values:
