@@ -20,7 +20,7 @@ import numpy as np
 from labapp.core.bench_check.adjustment import Sighting, adjust
 from labapp.core.bench_check.check import adjusted_bench, check_bench
 from labapp.core.bench_check.forecast import forecast, height_sigma
-from labapp.core.bench_check.labelling import Picture
+from labapp.core.bench_check.labelling import MirrorDots
 from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
@@ -176,7 +176,9 @@ def main() -> None:
                 (m, *seen_dots(surface_like(m, rng_pictures), bench, rng_pictures)) for m in mirrors
             ]
             if n < chosen.full:
-                pictures = [Picture(m.name, m, dots_at(place), SHAPE) for m, place, _ in sightings]
+                pictures = [
+                    MirrorDots(m.name, m, dots_at(place), SHAPE) for m, place, _ in sightings
+                ]
                 try:
                     check = check_bench(pictures, BEHIND_GLASS, CALIBRATION)
                 except CannotMeasure as error:

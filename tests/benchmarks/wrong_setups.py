@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from labapp.core.bench_check.check import BenchCheck, check_bench
-from labapp.core.bench_check.labelling import Picture
+from labapp.core.bench_check.labelling import MirrorDots
 from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
 from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.core.values import CannotMeasure, FloatArray
@@ -101,7 +101,7 @@ def checked(
     """Return the final check, if any, and the quantities named before."""
     rng = np.random.default_rng([18, seed])
     pictures = [
-        Picture(m.name, m, dots_at(seen_dots(surface_like(m, rng), bench, rng)[0]), SHAPE)
+        MirrorDots(m.name, m, dots_at(seen_dots(surface_like(m, rng), bench, rng)[0]), SHAPE)
         for m in mirrors
     ]
     try:

@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from labapp.core.images import dot_size
-from labapp.core.images.band_pass import _tuned, band_pass_dots
-from labapp.core.images.dots import BandPassSettings
+from labapp.core.images.band_pass import (
+    DetectorTuning,
+    _tuned,
+    band_pass_dots,
+    crowded_dots,
+    dot_at,
+)
+from labapp.core.images.dots import BandPassSettings, Dots
 from labapp.core.values import CannotMeasure, FloatArray
 from tests.scenes import gaussian_dots
 
@@ -180,6 +186,17 @@ def test_frame_without_dots_raises_no_dots(frame: FloatArray) -> None:
     with pytest.raises(CannotMeasure) as error:
         band_pass_dots(frame, BandPassSettings())
     assert error.value.status == "no-dots"
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 400)])
+def test_frame_too_small_for_a_dot_is_rejected(shape: tuple[int, int]) -> None:
+    frame, settings = np.random.default_rng(1).normal(size=shape), BandPassSettings()
+    for find in (crowded_dots, DetectorTuning.of):
+        with pytest.raises(CannotMeasure) as error:
+            find(frame, settings)
+        assert error.value.status == "no-dots"
+    with pytest.raises(ValueError, match="too small"):
+        dot_at(frame, 0.0, 0.0, Dots(*[np.empty(0)] * 7), settings)
 
 
 def test_number_of_blobs_is_limited_beside_a_blank_area() -> None:

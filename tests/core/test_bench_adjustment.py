@@ -97,7 +97,7 @@ def test_scipy_finds_no_lower_cost(gross_mm: float) -> None:
         loss = 2 * ROBUST**2 * (np.sqrt(1 + residual**2 / ROBUST**2) - 1)
         return np.append(np.copysign(np.sqrt(loss), residual), x)
 
-    minimum = equations.minimised(equations.start(), 1.0, 40)
+    minimum = equations.minimise(equations.start(), 1.0, 40)
     reference = scipy.optimize.least_squares(roots, minimum, max_nfev=10)
     assert roots(minimum) @ roots(minimum) == pytest.approx(2 * reference.cost, abs=0.01)
     np.testing.assert_allclose(minimum, reference.x, atol=0.05)

@@ -15,7 +15,7 @@ from labapp.config.setup import checked_setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.adjustment import adjust
 from labapp.core.bench_check.check import REASONS, BenchCheck, check_bench
 from labapp.core.bench_check.forecast import blind_spots, forecast
-from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
+from labapp.core.bench_check.labelling import MirrorDots, label_picture, sighting_of
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points, placed
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
@@ -74,7 +74,7 @@ def picture(
     *,
     missing: float = 0.0,
     false: int = 0,
-) -> tuple[Picture, np.ndarray]:
+) -> tuple[MirrorDots, np.ndarray]:
     """Return a mirror's picture, and the ray of each dot, counted from 0 (−1 for false dots)."""
     reflections = trace(surface, bench.rig)
     image_px = bench.view.to_image(reflections.plane_mm)
@@ -84,7 +84,7 @@ def picture(
     dots = np.vstack([dots, rng.uniform(10, [470, 630], (false, 2))])
     ray = np.vstack([np.argwhere(shown), np.full((false, 2), -1)])
     order = rng.permutation(len(dots))
-    return Picture(mirror.name, mirror, as_dots(dots[order], 0.12), SHAPE), ray[order]
+    return MirrorDots(mirror.name, mirror, as_dots(dots[order], 0.12), SHAPE), ray[order]
 
 
 def check_of(bench: SimulatedBench, free: tuple[str, ...] = ()) -> BenchCheck:
@@ -237,12 +237,14 @@ def test_written_setup_is_the_adjusted_one():
     ideal = ImageCalibration(matrix, lens_px)
     image_px = ideal.to_image(reflections.plane_mm[reflections.visible])
     dots = as_dots(image_px + rng.normal(0, 0.12, image_px.shape), 0.12)
-    plate = Picture("plate", Plate(), dots, SHAPE)
+    plate = MirrorDots("plate", Plate(), dots, SHAPE)
     check = check_bench([plate], setup.rig, setup.calibration, ["picture.u", "picture.v"])
     assert check.status == "ok"
     read = parse_setup(checked_setup(text, "setup.toml", check, "2026-11-24T12:00:00+00:00"), "")
     (result,) = check.pictures
-    computed, _ = landing_points(Plate(), result.pose, read.rig, tuple(result.ray.T - 1))
+    computed, _ = landing_points(
+        Plate(), check.adjustment.poses[0], read.rig, tuple(result.ray.T - 1)
+    )
     residual = read.calibration.to_plane(dots.image_px[result.dot]) - computed
     np.testing.assert_allclose(residual, result.residual_mm, atol=1e-4)
 
@@ -374,7 +376,7 @@ def test_single_mirror_in_a_rendered_picture_is_measured(kind: str, seed: int):
     }[kind]
     image = render(trace(surface, bench.rig), bench.view, Look(glow=0.0), rng).image
     dots = find_mirror_dots(image, DotSettings())
-    check = check_bench([Picture(kind, mirror, dots, image.shape)], RIG, CALIBRATION)
+    check = check_bench([MirrorDots(kind, mirror, dots, image.shape)], RIG, CALIBRATION)
     assert check.status == "ok"
     for size in check.pictures[0].sizes:
         assert size.measured_mm == pytest.approx(size.known_mm, rel=0.01)
@@ -391,7 +393,7 @@ def test_dot_noise_is_not_mistaken_for_a_wrong_scale(level_deg: float):
     reflections = trace(FlatMirror(), EXACT.rig)
     image_px = VIEW.to_image(reflections.plane_mm)[reflections.visible]
     dots = as_dots(image_px + rng.normal(0, 0.2, image_px.shape), 0.2)
-    check = check_bench([Picture("plate", plate, dots, SHAPE)], RIG, CALIBRATION)
+    check = check_bench([MirrorDots("plate", plate, dots, SHAPE)], RIG, CALIBRATION)
     assert (check.status, check.suspects) == ("ok", ())
 
 

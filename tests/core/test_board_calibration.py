@@ -210,6 +210,15 @@ def test_picture_without_the_expected_board_is_rejected(image, board, status):
     assert error.value.status in (status, "wrong-board")
 
 
+@pytest.mark.parametrize("board", [None, CHARUCO, CHESS])
+def test_picture_too_small_for_a_board_shows_no_board(board):
+    with pytest.raises(CannotMeasure, match="50 × 50 px is too small") as error:
+        calibrate_board([np.zeros((50, 50), np.uint8)], board)
+    assert error.value.status == "no-board"
+    with pytest.raises(CannotMeasure, match="no-target"):
+        calibrate_imaging_plane([np.zeros((50, 50), np.uint8)])
+
+
 def test_bent_board_is_rejected():
     _, image = shot(CHARUCO)
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)

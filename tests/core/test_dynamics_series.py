@@ -58,6 +58,29 @@ def test_peak_of_a_chirp_is_tracked():
     assert np.sqrt(np.mean((error / peak.frequency_sigma_hz) ** 2)) < 1.5
 
 
+def test_amplitude_of_a_peak_is_that_at_the_middle_of_a_segment_without_its_first_frames():
+    time = np.arange(384) / 200
+    value = np.exp(-2 * time) * np.cos(2 * np.pi * 25 * time)
+    every = track_peak(time, value, 0.64)
+    np.testing.assert_allclose(every.amplitude, np.exp(-2 * every.time_s), rtol=1e-3)
+    present = (time < 0.64) | (time > 0.90)
+    peak = track_peak(time[present], value[present], 0.64)
+    np.testing.assert_allclose(peak.time_s, every.time_s)
+    np.testing.assert_allclose(peak.amplitude, every.amplitude, rtol=1e-3)
+
+
+def test_time_of_a_segment_is_the_middle_of_its_frames_with_and_without_gaps():
+    time = np.arange(640) / 100
+    value = np.random.default_rng(7).normal(size=640)
+    present = np.arange(640) != 100
+    even = spectrogram(time, value, 0.64)
+    gappy = spectrogram(time[present], value[present], 0.64)
+    assert (even.method, gappy.method) == ("Welch", "Lomb-Scargle")
+    assert even.time_s[0] == pytest.approx(time[:64].mean())
+    np.testing.assert_allclose(even.time_s, gappy.time_s)
+    np.testing.assert_allclose(even.time_s, track_peak(time, value, 0.64).time_s)
+
+
 def test_too_short_segment_is_rejected():
     with pytest.raises(ValueError, match="fewer"):
         spectrogram(np.arange(100) / 100, np.zeros(100), 0.05)

@@ -210,6 +210,23 @@ def test_too_few_welds_or_sections_are_rejected() -> None:
         validated_model(few, "arx", settings)
 
 
+def test_features_are_held_no_longer_in_a_cross_validation() -> None:
+    # A gap of this length is bridged if the features are held twice.
+    settings = ModelSettings(("width_mm",), TARGET)
+    in_gap = abs(np.arange(200) - 90)[:, None] < MOST_HELD
+    welds = [replace(one, value=np.where(in_gap, np.nan, one.value)) for one in linear_welds(4, 1)]
+    model, left_out = validated_model(welds, "arx", settings)
+    direct = fit_model(welds, "arx", settings)
+    assert model.time_constants_s == direct.time_constants_s
+    assert model.scatter_mm == direct.scatter_mm
+    for one in welds:
+        others = [each for each in welds if each is not one]
+        expected = fit_model(others, "arx", settings, like=direct).predict(one)
+        of = np.array([name == one.name for name in left_out.weld])
+        at = np.rint((left_out.time_s[of] - expected.time_s[0]) / STEP_S).astype(int)
+        assert left_out.predicted[of] == pytest.approx(expected.value[at])
+
+
 def test_unexplained_weld_to_weld_scatter_widens_the_interval() -> None:
     """Each weld is off by its own amount: sections of one weld are not independent."""
     rng = np.random.default_rng(8)

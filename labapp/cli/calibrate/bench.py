@@ -15,7 +15,7 @@ from labapp.text import csv_text
 if TYPE_CHECKING:
     from labapp.config.setup import Setup
     from labapp.core.bench_check.check import BenchCheck
-    from labapp.core.bench_check.labelling import Picture
+    from labapp.core.bench_check.labelling import MirrorDots
     from labapp.core.bench_check.mirrors import Mirror
     from labapp.core.geometry.rig import Rig
 
@@ -103,15 +103,15 @@ def _checked(
         raise typer.Exit(NOTHING_MEASURED) from answer
 
 
-def mirror_picture(path: Path, mirror: Mirror) -> Picture:
+def mirror_picture(path: Path, mirror: Mirror) -> MirrorDots:
     """Find the dots in a picture of a mirror."""
-    from labapp.core.bench_check.labelling import Picture
+    from labapp.core.bench_check.labelling import MirrorDots
     from labapp.core.images.find_dots import DotSettings, find_mirror_dots
     from labapp.media import read_picture
 
     image = read_picture(path)
     height, width = image.shape
-    return Picture(path.name, mirror, find_mirror_dots(image, DotSettings()), (height, width))
+    return MirrorDots(path.name, mirror, find_mirror_dots(image, DotSettings()), (height, width))
 
 
 def _print_forecast(rig: Rig, mirrors: list[Mirror]) -> None:

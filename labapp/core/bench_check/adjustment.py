@@ -42,7 +42,7 @@ ROBUST = 3.0
 STEP = 1e-5
 """Step of the forward differences, in usual standard uncertainties."""
 
-ROUNDS, FEW_STEPS, MOST_STEPS = 12, 3, 40
+ROUNDS, FEW_ITERATIONS, MOST_ITERATIONS = 12, 3, 40
 """Iterations that tighten the robust loss; steps in each of them, and in the last."""
 
 SETTLED = 0.95
@@ -123,7 +123,7 @@ class Adjustment(ReadOnlyArrays):
     jacobian: FloatArray
     cost: float
 
-    def drop(self, columns: FloatArray) -> tuple[float, FloatArray]:
+    def cost_fall(self, columns: FloatArray) -> tuple[float, FloatArray]:
         """Reduction of the cost if further effects are added to the model, to first order.
 
         Parameters
@@ -133,7 +133,7 @@ class Adjustment(ReadOnlyArrays):
 
         Returns
         -------
-        drop, amplitudes
+        cost_fall, amplitudes
             Reduction as a χ² with k degrees of freedom (score test); amplitudes, shape (k,).
         """
         weighted = self.weight[:, None] * columns / self.scale**2
@@ -150,7 +150,7 @@ class Adjustment(ReadOnlyArrays):
 def adjust(
     rig: Rig,
     sightings: Sequence[Sighting],
-    released: FloatArray | None = None,
+    freed: FloatArray | None = None,
     start: FloatArray | None = None,
 ) -> Adjustment:
     """Adjust the bench and the mirrors' poses to the dots.
@@ -161,15 +161,15 @@ def adjust(
         The bench before the check; its uncertainty is the prior.
     sightings
         The mirrors and their dots.
-    released
+    freed
         Directions in the space of the bench's quantities along which the prior is widened by their
         length, shape (k, q).
     start
         Initial unknowns, from an adjustment to the same mirrors; None: the expected bench.
     """
-    system = System.of(rig, sightings, released)
+    system = System.of(rig, sightings, freed)
     unknown = system.start() if start is None or len(start) != system.size else start
-    return system.solved_from(unknown)
+    return system.solve_from(unknown)
 
 
 @dataclass(frozen=True)
@@ -181,11 +181,11 @@ class System:
     factor: FloatArray
 
     @classmethod
-    def of(cls, rig: Rig, sightings: Sequence[Sighting], released: FloatArray | None) -> System:
+    def of(cls, rig: Rig, sightings: Sequence[Sighting], freed: FloatArray | None) -> System:
         """Set up the equations with the prior widened, see `adjust`."""
         known = rig.uncertainty
         assert known is not None
-        root = known.root if released is None else np.column_stack([known.root, released.T])
+        root = known.root if freed is None else np.column_stack([known.root, freed.T])
         return cls(rig, tuple(sightings), root)
 
     @cached_property
@@ -332,32 +332,32 @@ class System:
         first = 2 * sum(len(s.ray) for s in self.sightings[:k])
         return slice(first, first + 2 * len(self.sightings[k].ray))
 
-    def solved_from(self, unknown: FloatArray) -> Adjustment:
+    def solve_from(self, unknown: FloatArray) -> Adjustment:
         """Iterate from initial unknowns to the adjustment."""
         scale = max(1.0, robust_sigma(self.residuals(unknown)))
         for _ in range(ROUNDS):
             # A large scale first tolerates gross errors; the loss tightens as residuals shrink.
             if scale == 1.0:
                 break
-            unknown = self.minimised(unknown, scale, FEW_STEPS)
+            unknown = self.minimise(unknown, scale, FEW_ITERATIONS)
             before, scale = scale, max(1.0, robust_sigma(self.residuals(unknown)))
             if scale > SETTLED * before:
                 break
         for _ in range(ROUNDS):
-            unknown = self.minimised(unknown, scale, MOST_STEPS)
+            unknown = self.minimise(unknown, scale, MOST_ITERATIONS)
             before, scale = scale, max(1.0, robust_sigma(self.residuals(unknown)))
             if scale > SETTLED * before:
                 break
         return self.adjustment(unknown, scale)
 
-    def solved(self, made: Adjustment) -> Adjustment:
+    def refitted_with_more_free(self, made: Adjustment) -> Adjustment:
         """Continue from another adjustment to the same dots, with more quantities free.
 
         The scale of the residuals is the same, so that the costs are comparable.
         """
         extra = self.size - len(made.unknown)
         unknown = np.insert(made.unknown, self.parts[0].stop - extra, np.zeros(extra))
-        return self.adjustment(self.minimised(unknown, made.scale, MOST_STEPS), made.scale)
+        return self.adjustment(self.minimise(unknown, made.scale, MOST_ITERATIONS), made.scale)
 
     def by_bench(self, made: Adjustment) -> FloatArray:
         """Derivatives of the residuals w.r.t. all quantities of the bench, shape (m, q)."""
@@ -374,7 +374,7 @@ class System:
         made[self._rows(k)] = np.where(np.isfinite(own), own, 0.0).reshape(-1, change_mm.shape[2])
         return made
 
-    def minimised(self, unknown: FloatArray, scale: float, steps: int) -> FloatArray:
+    def minimise(self, unknown: FloatArray, scale: float, steps: int) -> FloatArray:
         """Minimise the cost, with the dots' standard uncertainties multiplied by a scale.
 
         Levenberg–Marquardt on the normal equations, which the prior keeps regular.

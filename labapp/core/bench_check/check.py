@@ -14,15 +14,15 @@ from labapp.core.bench_check.known import MeasuredSize, measure_sizes
 from labapp.core.bench_check.labelling import (
     LEAST_DOTS,
     Labelled,
-    Picture,
+    MirrorDots,
     label_picture,
     relabelled,
     sighting_of,
 )
 from labapp.core.bench_check.mirrors import Plate, placed
-from labapp.core.bench_check.slips import slip_drop
-from labapp.core.bench_check.suspects import ALIKE, Suspect, find_suspects, released
-from labapp.core.bench_check.verdict import Pattern, Verdict, judge
+from labapp.core.bench_check.slips import slip_cost_fall
+from labapp.core.bench_check.suspects import ALIKE, Suspect, find_suspects, freed_directions
+from labapp.core.bench_check.verdict import ResidualPattern, ResidualVerdict, judge
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.perturbation import moved_bench, quantity_values
@@ -31,7 +31,7 @@ from labapp.core.geometry.uncertainty import QUANTITIES
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
-Status = Literal["ok", "quantity-off", "size-off"] | Verdict
+Status = Literal["ok", "quantity-off", "size-off"] | ResidualVerdict
 
 ROUNDS = 3
 """Largest number of iterations of adjusting to all pictures and relabelling."""
@@ -68,19 +68,15 @@ class CheckedPicture(ReadOnlyArrays):
         The dot by the set-up before the check, IPCS, shape (n, 2), mm.
     residual_mm
         Observed minus computed dot, shape (n, 2), mm.
-    pose, pose_sigma
-        The mirror's pose (`Mirror.parameters`) and its standard uncertainties, shape (d,).
     sizes
         The mirror's sizes, known and measured.
     """
 
-    picture: Picture
+    picture: MirrorDots
     dot: IntArray
     ray: IntArray
     plane_mm: FloatArray
     residual_mm: FloatArray
-    pose: FloatArray
-    pose_sigma: FloatArray
     sizes: tuple[MeasuredSize, ...]
 
     @property
@@ -120,8 +116,8 @@ class BenchCheck(ReadOnlyArrays):
 
     status: Status
     reason: str
-    verdict: Verdict
-    patterns: tuple[Pattern, ...]
+    verdict: ResidualVerdict
+    patterns: tuple[ResidualPattern, ...]
     suspects: tuple[Suspect, ...]
     free: tuple[str, ...]
     before: Rig
@@ -167,7 +163,10 @@ class QuantityChange:
 
 
 def check_bench(
-    pictures: Sequence[Picture], rig: Rig, calibration: ImageCalibration, free: Sequence[str] = ()
+    pictures: Sequence[MirrorDots],
+    rig: Rig,
+    calibration: ImageCalibration,
+    free: Sequence[str] = (),
 ) -> BenchCheck:
     """Adjust the set-up to pictures of known mirrors.
 
@@ -186,15 +185,15 @@ def check_bench(
         As `label_picture`.
     """
     pictures = [replace(one, mirror=placed(one.mirror, rig)) for one in pictures]
-    free_directions = released(rig, free)
+    freed = freed_directions(rig, free)
     bench = Bench(rig, calibration)
     observed = [Observation.of(p.dots, bench, p.frame_shape) for p in pictures]
-    made, sightings, used = _adjusted(pictures, observed, rig, calibration, free_directions)
-    suspects = find_suspects(rig, sightings, made, free_directions)
+    made, sightings, used = _adjusted(pictures, observed, rig, calibration, freed)
+    suspects = find_suspects(rig, sightings, made, freed)
     seen = [(o, p.mirror, own) for o, p, own in zip(observed, pictures, used, strict=True)]
-    slip = slip_drop(rig, seen, made, free_directions)
-    verdict, patterns = judge(rig, sightings, made, free_directions)
-    sizes = measure_sizes(rig, sightings, free_directions, made)
+    slip = slip_cost_fall(rig, seen, made, freed)
+    verdict, patterns = judge(rig, sightings, made, freed)
+    sizes = measure_sizes(rig, sightings, freed, made)
     named = {
         f"{size.name} in {picture.name}": size
         for picture, own in zip(pictures, sizes, strict=True)
@@ -209,8 +208,6 @@ def check_bench(
             ray=sighting.ray + 1,
             plane_mm=sighting.plane_mm,
             residual_mm=made.residual_mm[k],
-            pose=made.poses[k],
-            pose_sigma=np.sqrt(np.diag(made.pose_covariances[k])),
             sizes=sizes[k],
         )
         for k, (picture, sighting, found) in enumerate(zip(pictures, sightings, used, strict=True))
@@ -232,11 +229,11 @@ def check_bench(
 
 
 def _adjusted(
-    pictures: Sequence[Picture],
+    pictures: Sequence[MirrorDots],
     observed: Sequence[Observation],
     rig: Rig,
     calibration: ImageCalibration,
-    free_directions: FloatArray,
+    freed: FloatArray,
 ) -> tuple[Adjustment, list[Sighting], list[IntArray]]:
     """Adjust and label again in turn until no label changes.
 
@@ -245,14 +242,14 @@ def _adjusted(
     adjustment, sightings, labels
         The adjusted set-up; the dots of each picture that were used; and their labels.
     """
-    labels = _labelled(pictures, rig, calibration, free_directions)
+    labels = _labelled(pictures, rig, calibration, freed)
     made: Adjustment | None = None
     for _ in range(ROUNDS):
         sightings = [
             sighting_of(o, p.mirror, found)
             for o, p, found in zip(observed, pictures, labels, strict=True)
         ]
-        made = adjust(rig, sightings, free_directions, None if made is None else made.unknown)
+        made = adjust(rig, sightings, freed, None if made is None else made.unknown)
         again = [
             relabelled(o, p.mirror, made.offset, pose)
             for o, p, pose in zip(observed, pictures, made.poses, strict=True)
@@ -271,10 +268,10 @@ def _adjusted(
 
 
 def _labelled(
-    pictures: Sequence[Picture],
+    pictures: Sequence[MirrorDots],
     rig: Rig,
     calibration: ImageCalibration,
-    free_directions: FloatArray,
+    freed: FloatArray,
 ) -> list[IntArray]:
     """Label each picture; plates first, as they determine the bench for the others."""
     order = sorted(range(len(pictures)), key=lambda k: not isinstance(pictures[k].mirror, Plate))
@@ -282,14 +279,14 @@ def _labelled(
     near = rig, calibration
     for k in order:
         benches = [near, (rig, calibration), (_wide(rig), calibration)]
-        found, seen_by = _first_label(pictures[k], benches, free_directions)
+        found, seen_by = _first_label(pictures[k], benches, freed)
         labels[k] = found.labels
         near = adjusted_bench(seen_by, found.adjustment)
     return [labels[k] for k in range(len(pictures))]
 
 
 def _first_label(
-    picture: Picture, benches: Sequence[tuple[Rig, ImageCalibration]], free_directions: FloatArray
+    picture: MirrorDots, benches: Sequence[tuple[Rig, ImageCalibration]], freed: FloatArray
 ) -> tuple[Labelled, Rig]:
     """Return the labels from the first bench that succeeds, and its rig.
 
@@ -298,11 +295,11 @@ def _first_label(
     """
     for rig, calibration in benches[:-1]:
         try:
-            return label_picture(picture, rig, calibration, free_directions), rig
+            return label_picture(picture, rig, calibration, freed), rig
         except CannotMeasure:
             continue
     rig, calibration = benches[-1]
-    return label_picture(picture, rig, calibration, free_directions), rig
+    return label_picture(picture, rig, calibration, freed), rig
 
 
 def _wide(rig: Rig) -> Rig:
@@ -323,7 +320,7 @@ def adjusted_bench(
     return replace(after, uncertainty=known), calibration
 
 
-REASONS: dict[Verdict, str] = {
+REASONS: dict[ResidualVerdict, str] = {
     "noise-like": "",
     "distortion": "the picture is distorted in another way: calibrate the camera's lens",
     "plate-not-flat": "the plate is not flat: take a better one",
@@ -337,8 +334,8 @@ REASONS: dict[Verdict, str] = {
 
 def _status(
     suspects: Sequence[Suspect],
-    verdict: Verdict,
-    patterns: Sequence[Pattern],
+    verdict: ResidualVerdict,
+    patterns: Sequence[ResidualPattern],
     slip: float,
     sizes: Mapping[str, MeasuredSize],
 ) -> tuple[Status, str]:
@@ -347,8 +344,8 @@ def _status(
     The reason also states other causes that explain nearly as much.
     """
     lacks = verdict if verdict != "noise-like" else patterns[0].cause
-    explained = max((one.drop for one in patterns if one.cause == lacks), default=0.0)
-    suspected = suspects[0].drop if suspects else 0.0
+    explained = max((one.cost_fall for one in patterns if one.cause == lacks), default=0.0)
+    suspected = suspects[0].cost_fall if suspects else 0.0
     contradiction, sizes_off = _sizes_off(sizes)
     if slip > max(SLIPPED, suspected - ALIKE, contradiction - ALIKE):
         return "row-slipped", REASONS["row-slipped"]
@@ -367,7 +364,7 @@ def _status(
     else:
         return "ok", ""
     best, reason = causes.pop(status)
-    likely = [text for drop, text in causes.values() if drop > max(NEARLY * best, 0.0)]
+    likely = [text for fall, text in causes.values() if fall > max(NEARLY * best, 0.0)]
     return status, "; or ".join([reason, *likely])
 
 
@@ -387,5 +384,5 @@ def _sizes_off(sizes: Mapping[str, MeasuredSize]) -> tuple[float, str]:
 def _suspected(suspects: Sequence[Suspect]) -> str:
     """Describe the suspects in words."""
     names = " or ".join(one.name for one in suspects)
-    sure = np.sqrt(suspects[0].drop) if suspects else 0.0
+    sure = np.sqrt(suspects[0].cost_fall) if suspects else 0.0
     return f"{names}: off by far more than the ± in the set-up ({sure:.0f} standard deviations)"

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.bench_check.adjustment import MOST_STEPS, Sighting, System
+from labapp.core.bench_check.adjustment import MOST_ITERATIONS, Sighting, System
 from labapp.core.bench_check.check import BenchCheck, adjusted_bench
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points, placed
-from labapp.core.bench_check.suspects import released
+from labapp.core.bench_check.suspects import freed_directions
 from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
@@ -138,12 +138,12 @@ def _misled(check: BenchCheck, k: int, error_mm: float, pool: Cap) -> float:
     """
     wrong = replace(check.sightings[k], mirror=_raised(check.sightings[k].mirror, error_mm))
     sightings = [wrong if n == k else one for n, one in enumerate(check.sightings)]
-    system = System.of(check.before, sightings, released(check.before, check.free))
+    system = System.of(check.before, sightings, freed_directions(check.before, check.free))
     made, unknown = check.adjustment, check.adjustment.unknown.copy()
     # The estimated pose is kept; it differs by the error from the pose expected now.
     at = system.parts[k + 1].start + wrong.mirror.parameters.index("height_mm")
     unknown[at] -= error_mm / wrong.mirror.sigma[at - system.parts[k + 1].start]
-    again = system.adjustment(system.minimised(unknown, made.scale, MOST_STEPS), made.scale)
+    again = system.adjustment(system.minimise(unknown, made.scale, MOST_ITERATIONS), made.scale)
     rig, calibration = adjusted_bench(check.before, again)
     match = _expected_match(check.rig, pool)
     seen = calibration.to_plane(check.calibration.to_image(match.plane_mm))
@@ -162,7 +162,6 @@ def _raised(mirror: Mirror, by_mm: float) -> Mirror:
     """Return the mirror with its given height raised."""
     if isinstance(mirror, Ball):
         return replace(mirror, top_mm=float(mirror.pose[2]) + by_mm)
-    assert isinstance(mirror, Plate | Cap)
     return replace(mirror, height_mm=mirror.height_mm + by_mm)
 
 

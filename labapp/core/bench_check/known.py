@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.bench_check.adjustment import MOST_STEPS, Adjustment, Sighting, System, adjust
-from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, sphere_radius
+from labapp.core.bench_check.adjustment import MOST_ITERATIONS, Adjustment, Sighting, System, adjust
+from labapp.core.bench_check.mirrors import Cap, Mirror, Plate, sphere_radius
 from labapp.core.geometry.perturbation import moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
@@ -75,13 +75,13 @@ class MeasuredSize:
 
 
 def measure_sizes(
-    rig: Rig, sightings: Sequence[Sighting], released: FloatArray, made: Adjustment
+    rig: Rig, sightings: Sequence[Sighting], freed: FloatArray, made: Adjustment
 ) -> tuple[tuple[MeasuredSize, ...], ...]:
     """Measure the sizes of each mirror: its height, preceded by the radius of a ball or cap.
 
     Parameters
     ----------
-    rig, sightings, released
+    rig, sightings, freed
         What was adjusted, see `adjust`.
     made
         The adjustment.
@@ -91,7 +91,7 @@ def measure_sizes(
         mirror = sighting.mirror
         known = mirror.pose, np.diag(mirror.sigma**2)
         by_new = _by_adjusted_bench(rig, sighting, made)
-        independent = _without_size(rig, sightings, released, made, k)
+        independent = _without_size(rig, sightings, freed, made, k)
         sizes = []
         for name, size in _sizes(mirror).items():
             known_mm, known_sigma = _propagated(size, *known)
@@ -125,18 +125,18 @@ def _by_adjusted_bench(
 
 
 def _without_size(
-    rig: Rig, sightings: Sequence[Sighting], released: FloatArray, made: Adjustment, k: int
+    rig: Rig, sightings: Sequence[Sighting], freed: FloatArray, made: Adjustment, k: int
 ) -> tuple[FloatArray, FloatArray]:
     """Pose of a mirror, and its covariance, by an adjustment in which its size is free."""
     own = sightings[k].mirror
     loose = _loosened(own)
     others = [replace(s, mirror=loose) if n == k else s for n, s in enumerate(sightings)]
-    system = System.of(rig, others, released)
+    system = System.of(rig, others, freed)
     # A part of the pose that is known exactly is no unknown: its uncertainty stays zero.
     narrower = np.divide(own.sigma, loose.sigma, out=np.ones_like(own.sigma), where=loose.sigma > 0)
     unknown = made.unknown.copy()
     unknown[system.parts[k + 1]] *= narrower
-    found = system.adjustment(system.minimised(unknown, made.scale, MOST_STEPS), made.scale)
+    found = system.adjustment(system.minimise(unknown, made.scale, MOST_ITERATIONS), made.scale)
     return found.poses[k], found.pose_covariances[k]
 
 
@@ -170,6 +170,5 @@ def _loosened(mirror: Mirror) -> Mirror:
             height_sigma_mm=LOOSE * mirror.height_mm,
             diameter_sigma_mm=LOOSE * mirror.diameter_mm,
         )
-    assert isinstance(mirror, Ball)
     wide = LOOSE * mirror.diameter_mm
     return replace(mirror, top_sigma_mm=wide, diameter_sigma_mm=wide)

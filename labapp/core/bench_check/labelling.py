@@ -63,7 +63,7 @@ ROUNDS = 8
 
 
 @dataclass(frozen=True)
-class Picture:
+class MirrorDots:
     """Dots detected in a picture of a mirror.
 
     Parameters
@@ -104,10 +104,10 @@ class Labelled:
 
 
 def label_picture(
-    picture: Picture,
+    picture: MirrorDots,
     rig: Rig,
     calibration: ImageCalibration,
-    released: FloatArray | None = None,
+    freed: FloatArray | None = None,
 ) -> Labelled:
     """Assign a ray to every dot of a picture.
 
@@ -117,7 +117,7 @@ def label_picture(
         The picture.
     rig, calibration
         The set-up before the check.
-    released
+    freed
         See `adjust`.
 
     Raises
@@ -141,7 +141,7 @@ def label_picture(
     found: list[Labelled] = []
     for first in (_by_grid, _by_places):
         starts = _likeliest(first(observed, picture), observed)
-        grown = (_grown(observed, picture.mirror, released, one) for one in starts)
+        grown = (_grown(observed, picture.mirror, freed, one) for one in starts)
         found += [one for one in grown if one is not None]
         if any(_explains(observed, one) for one in found):
             break
@@ -173,7 +173,7 @@ def _likeliest(starts: list[IntArray], observed: Observation) -> list[IntArray]:
     return [starts[k] for k in order if penalties[k] <= penalties.min() + MOST_WORSE]
 
 
-def _by_grid(observed: Observation, picture: Picture) -> list[IntArray]:
+def _by_grid(observed: Observation, picture: MirrorDots) -> list[IntArray]:
     """Labels from the rows and columns in the picture, for the absent ray at each empty site."""
     pattern = observed.rig.pattern
     try:
@@ -186,7 +186,7 @@ def _by_grid(observed: Observation, picture: Picture) -> list[IntArray]:
     return [labels_from_lattice(lattice, s, pattern.marker, "S/S", shape) for s in sites]
 
 
-def _by_places(observed: Observation, picture: Picture) -> list[IntArray]:
+def _by_places(observed: Observation, picture: MirrorDots) -> list[IntArray]:
     """Labels from the dots predicted for a ball or cap on a grid of trial positions.
 
     Labels shifted by a row or column, with the mirror moved accordingly, fit a bench that may be
@@ -272,7 +272,7 @@ def relabelled(
 def _grown(
     observed: Observation,
     mirror: Mirror,
-    released: FloatArray | None,
+    freed: FloatArray | None,
     labels: IntArray,
 ) -> Labelled | None:
     """Iterate adjustment and labelling from initial labels; None without the absent ray's hole."""
@@ -280,7 +280,7 @@ def _grown(
     for _ in range(ROUNDS):
         if (labels != UNLABELLED).sum() < LEAST_DOTS:
             return None
-        made = adjust(observed.rig, [sighting_of(observed, mirror, labels)], released, start)
+        made = adjust(observed.rig, [sighting_of(observed, mirror, labels)], freed, start)
         start, before = made.unknown, labels
         labels = relabelled(observed, mirror, made.offset, made.poses[0])
         if (labels == before).all():

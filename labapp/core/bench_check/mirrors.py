@@ -1,12 +1,12 @@
 """Mirrors of known shape, and the points where reflected rays meet the imaging plane.
 
-A mirror has a *pose*, the vector of its uncertain parameters, with standard uncertainties.
+A mirror has a *pose*, the vector of its uncertain parameters, with standard uncertainties. The
+names of the parameters have the unit as suffix.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -21,50 +21,6 @@ from labapp.core.values import BoolArray, FloatArray, IntArray
 
 FREE_MM = 10.0
 """Standard uncertainty of an unknown length, mm."""
-
-
-class Mirror(Protocol):
-    """Interface of a mirror in a bench check; its pose has d parameters."""
-
-    @property
-    def name(self) -> str:
-        """The mirror in a few words, with its size."""
-        ...
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the pose's parameters, with the unit as suffix."""
-        ...
-
-    @property
-    def pose(self) -> FloatArray:
-        """Expected pose, shape (d,)."""
-        ...
-
-    @property
-    def sigma(self) -> FloatArray:
-        """Standard uncertainty of each parameter, shape (d,)."""
-        ...
-
-    def meet(
-        self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Intersect rays with the mirror at a pose.
-
-        Parameters
-        ----------
-        source_mm, direction
-            The laser, shape (3,), mm; the rays' unit directions, shape (…, 3).
-        pose
-            Shape (d,).
-
-        Returns
-        -------
-        point_mm, normal, hit
-            Point and upward normal, shapes (…, 3), also slightly beyond the mirror's edge, so that
-            they are smooth functions of the pose; whether the ray meets the mirror, shape (…).
-        """
-        ...
 
 
 @dataclass(frozen=True)
@@ -99,18 +55,32 @@ class Plate:
 
     @property
     def pose(self) -> FloatArray:
-        """The pose that is expected."""
+        """Expected pose, shape (d,)."""
         return np.array([self.height_mm, 0.0, 0.0])
 
     @property
     def sigma(self) -> FloatArray:
-        """Standard uncertainty of each parameter."""
+        """Standard uncertainty of each parameter, shape (d,)."""
         return np.array([self.height_sigma_mm, self.tilt_sigma_deg, self.tilt_sigma_deg])
 
     def meet(
         self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Where rays meet the plate, see `Mirror`."""
+        """Intersect rays with the mirror at a pose.
+
+        Parameters
+        ----------
+        source_mm, direction
+            The laser, shape (3,), mm; the rays' unit directions, shape (…, 3).
+        pose
+            Shape (d,).
+
+        Returns
+        -------
+        point_mm, normal, hit
+            Point and upward normal, shapes (…, 3), also slightly beyond the mirror's edge, so that
+            they are smooth functions of the pose; whether the ray meets the mirror, shape (…).
+        """
         normal = np.append(-np.tan(np.radians(pose[1:3])), 1.0)
         falls = direction @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -129,15 +99,12 @@ class Cap:
         Diameter of its rim, which lies on the work piece, and height of its top.
     diameter_sigma_mm, height_sigma_mm
         Standard uncertainties of these; the defaults are those of a caliper and a dial gauge.
-    place_sigma_mm
-        Standard uncertainty of its top's position about the origin, along X and along Y.
     """
 
     diameter_mm: float
     height_mm: float
     diameter_sigma_mm: float = 0.02
     height_sigma_mm: float = 0.005
-    place_sigma_mm: float = FREE_MM
 
     @property
     def name(self) -> str:
@@ -151,24 +118,18 @@ class Cap:
 
     @property
     def pose(self) -> FloatArray:
-        """The pose that is expected."""
+        """Expected pose, shape (d,)."""
         return np.array([0.0, 0.0, self.height_mm, self.diameter_mm])
 
     @property
     def sigma(self) -> FloatArray:
-        """Standard uncertainty of each parameter."""
-        place = self.place_sigma_mm
-        return np.array([place, place, self.height_sigma_mm, self.diameter_sigma_mm])
-
-    @property
-    def radius_mm(self) -> float:
-        """Radius of its sphere, mm."""
-        return sphere_radius(self.diameter_mm, self.height_mm)
+        """Standard uncertainty of each parameter, shape (d,)."""
+        return np.array([FREE_MM, FREE_MM, self.height_sigma_mm, self.diameter_sigma_mm])
 
     def meet(
         self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Where rays meet the cap, see `Mirror`."""
+        """Intersect rays with the cap, see `Plate.meet`."""
         x, y, top, diameter = pose
         radius = sphere_radius(diameter, top)
         center = np.array([x, y, top - radius])
@@ -190,8 +151,6 @@ class Ball:
         is the diameter.
     diameter_sigma_mm, top_sigma_mm
         Standard uncertainties of these.
-    place_sigma_mm
-        Standard uncertainty of its position about `place_mm`, along X and along Y.
     place_mm
         Expected X and Y of its top, see `placed`.
     """
@@ -200,7 +159,6 @@ class Ball:
     top_mm: float | None = None
     diameter_sigma_mm: float = 0.002
     top_sigma_mm: float = 0.01
-    place_sigma_mm: float = FREE_MM
     place_mm: tuple[float, float] = (0.0, 0.0)
 
     @property
@@ -215,29 +173,27 @@ class Ball:
 
     @property
     def pose(self) -> FloatArray:
-        """The pose that is expected."""
+        """Expected pose, shape (d,)."""
         top = self.diameter_mm if self.top_mm is None else self.top_mm
         return np.array([*self.place_mm, top, self.diameter_mm])
 
     @property
     def sigma(self) -> FloatArray:
-        """Standard uncertainty of each parameter."""
-        place = self.place_sigma_mm
-        return np.array([place, place, self.top_sigma_mm, self.diameter_sigma_mm])
-
-    @property
-    def radius_mm(self) -> float:
-        """Radius, mm."""
-        return self.diameter_mm / 2
+        """Standard uncertainty of each parameter, shape (d,)."""
+        return np.array([FREE_MM, FREE_MM, self.top_sigma_mm, self.diameter_sigma_mm])
 
     def meet(
         self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Where rays meet the ball above the work piece, see `Mirror`."""
+        """Intersect rays with the ball above the work piece, see `Plate.meet`."""
         x, y, top, diameter = pose
         center = np.array([x, y, top - diameter / 2])
         point, normal, met = _meet_sphere(source_mm, direction, center, diameter / 2)
         return point, normal, np.asarray(met & (point[..., 2] > 0) & (normal[..., 2] > 0))
+
+
+Mirror = Plate | Cap | Ball
+"""A mirror in a bench check; its pose has d parameters."""
 
 
 def placed(mirror: Mirror, rig: Rig) -> Mirror:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
+from labapp.core.bench_check.labelling import MirrorDots, label_picture, sighting_of
 from labapp.core.bench_check.mirrors import Plate
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.optics import direction_to_dots
@@ -52,7 +52,7 @@ class PatternCalibration(ReadOnlyArrays):
     disagreement: float
 
 
-def calibrate_pattern(pictures: Sequence[Picture], bench: Bench) -> PatternCalibration:
+def calibrate_pattern(pictures: Sequence[MirrorDots], bench: Bench) -> PatternCalibration:
     """Measure the rays of a pattern from pictures of plates at different heights.
 
     Parameters
@@ -101,7 +101,7 @@ def calibrate_pattern(pictures: Sequence[Picture], bench: Bench) -> PatternCalib
 
 
 def _unfolded(
-    bench: Bench, picture: Picture, plane_mm: FloatArray, covariance_mm2: FloatArray
+    bench: Bench, picture: MirrorDots, plane_mm: FloatArray, covariance_mm2: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Tangents of the rays of n dots to the beam axis, and their σ, shapes (n, 2)."""
     laser, plane = bench.rig.laser, bench.rig.imaging_plane

@@ -34,11 +34,11 @@ Seen = tuple[Observation, Mirror, IntArray]
 """A picture's dots, its mirror, and the index of each ray's dot."""
 
 
-def slip_drop(
+def slip_cost_fall(
     rig: Rig,
     seen: Sequence[Seen],
     made: Adjustment,
-    released: FloatArray,
+    freed: FloatArray,
 ) -> float:
     """Reduction of the cost with the rays of the next row or column; −inf if there is none.
 
@@ -47,7 +47,7 @@ def slip_drop(
 
     Parameters
     ----------
-    rig, released
+    rig, freed
         What was adjusted, see `adjust`.
     seen
         Each picture's dots, mirror and labels.
@@ -65,14 +65,14 @@ def slip_drop(
     possible = [one for one in possible if min(map(_lit, one)) >= LEAST_DOTS]
     if not possible:
         return -np.inf
-    tried = [(_adjusted(rig, one, made.scale, released), one) for one in possible]
+    tried = [(_adjusted(rig, one, made.scale, freed), one) for one in possible]
     near, best = min(tried, key=lambda pair: pair[0].cost + STRAY * _strays(pair[1]))
     again = [
         (observed, mirror, relabelled(observed, mirror, near.offset, pose))
         for (observed, mirror, _), pose in zip(best, near.poses, strict=True)
     ]
     best = again if min(map(_lit, again)) >= LEAST_DOTS else best
-    found = _adjusted(rig, best, made.scale, released, near)
+    found = _adjusted(rig, best, made.scale, freed, near)
     return made.cost + STRAY * strays - found.cost - STRAY * _strays(best)
 
 
@@ -80,16 +80,16 @@ def _adjusted(
     rig: Rig,
     seen: Sequence[Seen],
     scale: float,
-    released: FloatArray,
+    freed: FloatArray,
     near: Adjustment | None = None,
 ) -> Adjustment:
     """Adjust to labels, roughly or from a similar adjustment; the absent ray may have a dot."""
     sightings = [
         sighting_of(observed, mirror, labels, with_absent=True) for observed, mirror, labels in seen
     ]
-    system = System.of(rig, sightings, released)
+    system = System.of(rig, sightings, freed)
     start, steps = (system.start(), FEW_STEPS) if near is None else (near.unknown, STEPS)
-    return system.adjustment(system.minimised(start, scale, steps), scale)
+    return system.adjustment(system.minimise(start, scale, steps), scale)
 
 
 def _lit(one: Seen) -> int:

@@ -54,16 +54,16 @@ class Suspect:
         of the image calibration.
     name
         Its name.
-    drop
+    cost_fall
         Reduction of the cost if it is free: the square of its deviation in standard deviations.
     """
 
     key: str
     name: str
-    drop: float
+    cost_fall: float
 
 
-def released(rig: Rig, keys: Sequence[str]) -> FloatArray:
+def freed_directions(rig: Rig, keys: Sequence[str]) -> FloatArray:
     """Directions in the space of the quantities that are freed by keys of suspects, shape (k, q).
 
     Raises
@@ -81,7 +81,7 @@ def suspect_keys() -> tuple[str, ...]:
 
 
 def find_suspects(
-    rig: Rig, sightings: Sequence[Sighting], made: Adjustment, already: FloatArray
+    rig: Rig, sightings: Sequence[Sighting], made: Adjustment, freed: FloatArray
 ) -> tuple[Suspect, ...]:
     """Find the quantities that reduce the cost most when freed, the likeliest first.
 
@@ -94,13 +94,13 @@ def find_suspects(
         The bench before the check, and the mirrors' dots.
     made
         The adjustment to these.
-    already
-        Directions already free in it, see `released`.
+    freed
+        Directions free in it, see `freed_directions`.
     """
     every = {one.key: one for one in directions(rig)}
-    system = System.of(rig, sightings, already)
+    system = System.of(rig, sightings, freed)
     by_bench = system.by_bench(made)
-    first = {key: made.drop(by_bench @ _free(one)[:, None])[0] for key, one in every.items()}
+    first = {key: made.cost_fall(by_bench @ _free(one)[:, None])[0] for key, one in every.items()}
     most = max(first.values())
     if most < LIMIT:
         return ()
@@ -108,13 +108,17 @@ def find_suspects(
     likely = sorted(first, key=lambda key: -first[key])[:TRIED]
     found = []
     for key in likely:
-        system = System.of(rig, sightings, np.vstack([already, _free(every[key])]))
-        found.append(Suspect(key, every[key].name, made.cost - system.solved(made).cost))
-    found.sort(key=lambda one: -one.drop)
-    if found[0].drop < LIMIT:
+        system = System.of(rig, sightings, np.vstack([freed, _free(every[key])]))
+        found.append(
+            Suspect(key, every[key].name, made.cost - system.refitted_with_more_free(made).cost)
+        )
+    found.sort(key=lambda one: -one.cost_fall)
+    if found[0].cost_fall < LIMIT:
         return ()
     return tuple(
-        one for one in found if one.drop > found[0].drop - max(ALIKE, 0.02 * found[0].drop)
+        one
+        for one in found
+        if one.cost_fall > found[0].cost_fall - max(ALIKE, 0.02 * found[0].cost_fall)
     )
 
 

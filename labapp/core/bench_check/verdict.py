@@ -20,7 +20,7 @@ from labapp.core.geometry.perturbation import moved_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
 
-Verdict = Literal[
+ResidualVerdict = Literal[
     "noise-like", "distortion", "plate-not-flat", "wrong-lens", "row-slipped", "unexplained"
 ]
 
@@ -38,54 +38,62 @@ COARSE = 2.0
 
 
 @dataclass(frozen=True)
-class Pattern:
+class ResidualPattern:
     """A cause, and the part of the residuals that it explains.
 
     Parameters
     ----------
     cause
         The cause.
-    drop
+    cost_fall
         Reduction of the cost, in units of χ².
     rms_mm
         Root mean square of the explained part, mm.
     """
 
-    cause: Verdict
-    drop: float
+    cause: ResidualVerdict
+    cost_fall: float
     rms_mm: float
 
 
 def judge(
-    rig: Rig, sightings: Sequence[Sighting], made: Adjustment, released: FloatArray
-) -> tuple[Verdict, tuple[Pattern, ...]]:
+    rig: Rig, sightings: Sequence[Sighting], made: Adjustment, freed: FloatArray
+) -> tuple[ResidualVerdict, tuple[ResidualPattern, ...]]:
     """Classify the residuals of an adjustment: the verdict, and the patterns, the likeliest first.
 
     Parameters
     ----------
-    rig, sightings, released
+    rig, sightings, freed
         What was adjusted, see `adjust`.
     made
         The adjustment.
     """
-    system = System.of(rig, sightings, released)
+    system = System.of(rig, sightings, freed)
     left = float(np.sum(made.weight * (made.standardised / made.scale) ** 2))
     size = np.sqrt(np.mean(np.concatenate([r.ravel() for r in made.residual_mm]) ** 2))
     unit = float(size / np.sqrt(np.mean(made.standardised**2)))
     found, sure = [], []
     for cause, columns in _causes(rig, made, system):
-        drop, amplitudes = made.drop(columns)
-        pattern = Pattern(cause, drop, float(np.sqrt(np.mean((columns @ amplitudes) ** 2))) * unit)
+        cost_fall, amplitudes = made.cost_fall(columns)
+        pattern = ResidualPattern(
+            cause, cost_fall, float(np.sqrt(np.mean((columns @ amplitudes) ** 2))) * unit
+        )
         found.append(pattern)
-        if drop > SURE + columns.shape[1] and drop > SHARE * left and pattern.rms_mm > PATTERN_MM:
+        if (
+            cost_fall > SURE + columns.shape[1]
+            and cost_fall > SHARE * left
+            and pattern.rms_mm > PATTERN_MM
+        ):
             sure.append(pattern)
-    found.sort(key=lambda one: -one.drop)
+    found.sort(key=lambda one: -one.cost_fall)
     if sure:
-        return max(sure, key=lambda one: one.drop).cause, tuple(found)
+        return max(sure, key=lambda one: one.cost_fall).cause, tuple(found)
     return ("unexplained" if made.scale > COARSE else "noise-like"), tuple(found)
 
 
-def _causes(rig: Rig, made: Adjustment, system: System) -> Iterator[tuple[Verdict, FloatArray]]:
+def _causes(
+    rig: Rig, made: Adjustment, system: System
+) -> Iterator[tuple[ResidualVerdict, FloatArray]]:
     """Each cause, with the changes of the standardised residuals per amplitude, shape (m, c)."""
     bench = moved_rig(rig, made.offset)
     every = list(enumerate(zip(system.sightings, made.poses, strict=True)))

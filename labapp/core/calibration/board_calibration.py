@@ -16,7 +16,7 @@ import numpy as np
 from labapp.core.calibration.boards import Board, BoardCorners, find_board
 from labapp.core.calibration.lens_fit import LensFit, PlaneView, covered, fit_lens, fit_terms
 from labapp.core.calibration.seen_axes import POINTS, SeenAxes
-from labapp.core.calibration.target_marks import Image
+from labapp.core.calibration.target_marks import ColourOrGrey
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.values import CannotMeasure, FloatArray
 
@@ -184,7 +184,7 @@ class BoardCalibration(SeenAxes):
         ]
 
 
-def calibrate_board(images: Sequence[Image], board: Board | None = None) -> BoardCalibration:
+def calibrate_board(images: Sequence[ColourOrGrey], board: Board | None = None) -> BoardCalibration:
     """Calibrate the camera from pictures of a board.
 
     Parameters

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.calibration.board_corner import fit_corner
-from labapp.core.calibration.target_marks import Image, grey_levels
+from labapp.core.calibration.target_marks import ColourOrGrey, grey_levels
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 Kind = Literal["charuco", "chessboard"]
@@ -183,7 +183,7 @@ class BoardCorners(ReadOnlyArrays):
         return BoardCorners(self.board, self.index[which], self.image_px[which])
 
 
-def find_board(image: Image, board: Board | None = None) -> BoardCorners:
+def find_board(image: ColourOrGrey, board: Board | None = None) -> BoardCorners:
     """Find the inner corners of a board in a picture.
 
     Parameters
@@ -201,7 +201,10 @@ def find_board(image: Image, board: Board | None = None) -> BoardCorners:
         ``no-board`` if no board is found, ``wrong-board`` if another one is; the reason states
         which.
     """
-    levels = grey_levels(image)
+    try:
+        levels = grey_levels(image)
+    except CannotMeasure as too_small:
+        raise CannotMeasure("no-board", too_small.reason) from None
     grey = _stretched(levels)
     if board is None:
         board = _recognised(grey)
@@ -217,7 +220,7 @@ def find_board(image: Image, board: Board | None = None) -> BoardCorners:
     return found
 
 
-def is_charuco(image: Image) -> bool:
+def is_charuco(image: ColourOrGrey) -> bool:
     """Whether a picture shows markers of one of `BOARDS`."""
     ids = _markers(_stretched(grey_levels(image)), "4X4_250")
     return any(_share(board, ids) for board in BOARDS.values())

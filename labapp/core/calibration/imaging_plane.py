@@ -11,7 +11,7 @@ from labapp.core.calibration.plane_calibration import (
     PlaneCalibrationSettings,
     calibrate_plane,
 )
-from labapp.core.calibration.target_marks import Image
+from labapp.core.calibration.target_marks import ColourOrGrey
 from labapp.core.geometry.coordinates import Lens
 from labapp.core.values import CannotMeasure
 
@@ -19,7 +19,7 @@ Calibration = PlaneCalibration | BoardCalibration
 
 
 def calibrate_imaging_plane(
-    images: Sequence[Image],
+    images: Sequence[ColourOrGrey],
     settings: PlaneCalibrationSettings | None = None,
     board: Board | None = None,
     lens: Lens | None = None,

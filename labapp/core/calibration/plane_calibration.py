@@ -25,7 +25,7 @@ from labapp.core.calibration.target_bars import (
     measured_bar,
 )
 from labapp.core.calibration.target_marks import (
-    Image,
+    ColourOrGrey,
     Mark,
     Refusal,
     grey_levels,
@@ -220,7 +220,7 @@ class PlaneCalibration(SeenAxes):
 
 
 def calibrate_plane(
-    image: Image, settings: PlaneCalibrationSettings | None = None, lens: Lens | None = None
+    image: ColourOrGrey, settings: PlaneCalibrationSettings | None = None, lens: Lens | None = None
 ) -> PlaneCalibration:
     """Find O′ and the axes in a picture of the imaging plane (§5.1.2).
 

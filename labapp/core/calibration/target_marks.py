@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, ReadOnlyArrays, robust_sigma
 
-Image = npt.NDArray[Any]
+ColourOrGrey = npt.NDArray[Any]
 
 MEDIAN_PX, DILATIONS = 7, 12
 """Side of the median filter, and largest number of dilations by 3 × 3, in a picture of 640 px; both
@@ -59,7 +59,7 @@ class Mark(ReadOnlyArrays):
     width: float
 
 
-def grey_levels(image: Image) -> FloatArray:
+def grey_levels(image: ColourOrGrey) -> FloatArray:
     """Return the grey levels of a picture without impulse noise, shape (rows, columns).
 
     Raises

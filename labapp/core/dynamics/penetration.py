@@ -156,7 +156,10 @@ class PenetrationModel(ReadOnlyArrays):
         ValueError
             As `in_steps` does.
         """
-        steps = in_steps(weld, self.settings.step_s)
+        return self.predict_steps(in_steps(weld, self.settings.step_s))
+
+    def predict_steps(self, steps: WeldSeries) -> Prediction:
+        """As `predict`, from features that `in_steps` averaged."""
         x, noise, level = regressors(steps, self.response, self.settings.orders)
         there = np.isfinite(x).all(axis=1)
         given = x[there]
@@ -206,7 +209,16 @@ def fit_model(
     ImportError
         If scikit-learn is missing.
     """
-    steps = [in_steps(one, settings.step_s) for one in welds]
+    return _fit_steps([in_steps(one, settings.step_s) for one in welds], kind, settings, like)
+
+
+def _fit_steps(
+    steps: Sequence[WeldSeries],
+    kind: Kind,
+    settings: ModelSettings,
+    like: PenetrationModel | None = None,
+) -> PenetrationModel:
+    """As `fit_model`, from features that `in_steps` averaged."""
     constants = _find_time_constants(steps, settings, like)
     rows = _rows(steps, impulse_response(constants, settings.step_s), settings.orders)
     width = rows.x.shape[1]
@@ -350,13 +362,13 @@ def validated_model(
     used = [one for one in steps if np.isfinite(one.target).any()]
     if len(used) < 3:
         raise ValueError(f"{len(used)} welds have sections; 3 are needed")
-    model = fit_model(used, kind, settings)
+    model = _fit_steps(used, kind, settings)
     names: list[str] = []
     parts = []
     for done, one in enumerate(used, 1):
         progress(done, len(used) + 1)
         others = [each for each in used if each is not one]
-        found = fit_model(others, kind, settings, like=model).predict(one)
+        found = _fit_steps(others, kind, settings, like=model).predict_steps(one)
         cut = np.isfinite(one.target) & np.isfinite(found.value)
         names += [one.name] * int(cut.sum())
         columns = one.time_s, one.target, one.target_sigma, found.value, found.sigma

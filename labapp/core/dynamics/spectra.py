@@ -40,15 +40,12 @@ class Spectrum(ReadOnlyArrays):
         Frequencies and densities, shape (f,), Hz and unit²/Hz.
     low, high
         Confidence interval of the density (χ²), shape (f,).
-    degrees_of_freedom
-        Degrees of freedom of the χ² distribution.
     """
 
     frequency_hz: FloatArray
     density: FloatArray
     low: FloatArray
     high: FloatArray
-    degrees_of_freedom: float
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ class Spectrogram(ReadOnlyArrays):
         density = self.density[there].mean(axis=0) if count else self.density.sum(axis=0)
         freedom = 2 * count / (1 + 2 * OVERLAP_SHARE * max(count - 1, 0) / max(count, 1))
         low, high = freedom / stats.chi2.ppf([(1 + confidence) / 2, (1 - confidence) / 2], freedom)
-        return Spectrum(self.frequency_hz, density, density * low, density * high, freedom)
+        return Spectrum(self.frequency_hz, density, density * low, density * high)
 
 
 @dataclass(frozen=True)
@@ -123,9 +120,8 @@ def spectrogram(
         frequency, middle, density = signal.spectrogram(
             values, 1 / step, "hann", length, length // 2, detrend="linear"
         )
-        return Spectrogram(
-            time_s[0] + middle, frequency[1:], density.T[:, 1:], "Welch", length * step
-        )
+        middle = time_s[0] + middle - step / 2  # SciPy counts from half a frame before the first
+        return Spectrogram(middle, frequency[1:], density.T[:, 1:], "Welch", length * step)
     frequency = np.asarray(np.fft.rfftfreq(length, step)[1:], float)
     begins = _begins(time_s, step, length)
     density = np.full((len(begins), len(frequency)), np.nan)
@@ -157,7 +153,7 @@ def track_peak(
         if within.sum() < max(FEWEST, LEAST_FILLED * length):
             continue
         for one in fit_oscillations(time_s[within], values[within], 1, band_hz):
-            at = length * step / 2
+            at = begin + length * step / 2 - time_s[within][0]
             size = float(abs(one.amplitude[0]) * np.exp(-one.damping_per_s * at))
             column[:] = one.frequency_hz, one.frequency_sigma_hz, size
     frequency, sigma, amplitude = found

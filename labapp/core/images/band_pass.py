@@ -96,6 +96,9 @@ AROUND_PX2 = 3.0
 """Least variance of that blur in the joint fit, px² of the downsampled picture, so that its samples
 resolve it."""
 
+LEAST_SIDE_PX, NO_ROOM = 8, "the frame is blank or too small to hold a dot"
+"""Least height and width of a frame that can hold a dot, px; reason if it is smaller or blank."""
+
 LEAST_SIGMA_PX = 0.02
 """Added in quadrature to the position uncertainty of jointly fitted dots, px."""
 
@@ -122,7 +125,13 @@ class DetectorTuning(ReadOnlyArrays):
 
     @classmethod
     def of(cls, frame: Image, settings: BandPassSettings) -> DetectorTuning:
-        """Estimate the tuning from a frame, shape (height, width), of any real type."""
+        """Estimate the tuning from a frame, shape (height, width), of any real type.
+
+        Raises
+        ------
+        CannotMeasure
+            ``no-dots`` if the frame is too small to hold a dot.
+        """
         return _tuned(as_picture(frame), settings)[0]
 
     @cached_property
@@ -152,8 +161,8 @@ def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
 def tuned_dots(frame: Image, settings: BandPassSettings) -> tuple[Dots, DetectorTuning]:
     """Find the dots of a frame (`band_pass_dots`) and the tuning for the following frames."""
     picture = as_picture(np.asarray(frame))
-    if picture.ndim != 2 or min(picture.shape) < 8 or not float(np.ptp(picture)) > 0:
-        raise CannotMeasure("no-dots", "the frame is blank or too small to hold a dot")
+    if picture.size and not float(np.ptp(picture)) > 0:
+        raise CannotMeasure("no-dots", NO_ROOM)
     tuning, seen = _tuned(picture, settings)
     return _found(tuning, seen, settings), tuning
 
@@ -192,7 +201,7 @@ def crowded_dots(frame: Image, settings: BandPassSettings) -> Dots:
     Raises
     ------
     CannotMeasure
-        ``no-dots`` if nothing stands out of the noise.
+        ``no-dots`` if nothing stands out of the noise, or the frame is too small to hold a dot.
     """
     tuning, seen = _tuned(as_picture(frame), settings)
     return _top_to_bottom(_fitted(seen, _kept(tuning, seen, settings), tuning.noise))
@@ -219,10 +228,18 @@ def dot_at(
     Dots
         One dot, with centroid and uncertainty as from `band_pass_dots`. Without another peak
         within two dot sizes, it is at (u_px, v_px) with the dot size as its uncertainty.
+
+    Raises
+    ------
+    ValueError
+        If the frame is too small to hold a dot.
     """
     size = settings.size_px or (float(np.median(others.size_px)) if len(others) else None)
     like = BandPassSettings(size, FAINT_SIGMA, 0.0, settings.speckle_px)
-    tuning, seen = _tuned(as_picture(frame), like)
+    try:
+        tuning, seen = _tuned(as_picture(frame), like)
+    except CannotMeasure as why:
+        raise ValueError(why.reason) from why
     size = tuning.size_px
     u, v, _ = seen.peaks(tuning)
     away = np.hypot(u - u_px, v - v_px)
@@ -255,7 +272,15 @@ def typical(brightness: FloatArray) -> float:
 
 
 def _tuned(picture: Picture, settings: BandPassSettings) -> tuple[DetectorTuning, _BandPassed]:
-    """Return a picture's tuning and its band-passed picture."""
+    """Return a picture's tuning and its band-passed picture.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-dots`` if the picture is too small to hold a dot.
+    """
+    if picture.ndim != 2 or min(picture.shape) < LEAST_SIDE_PX:
+        raise CannotMeasure("no-dots", NO_ROOM)
     noise = local_noise(picture)
     size = settings.size_px or estimate_size(picture, noise)
     seen = _BandPassed(without_spikes(picture, noise, size), size)

@@ -13,7 +13,9 @@ import scipy
 from labapp.core.images.dots import Dots, Grey, Image
 from labapp.core.values import BoolArray, FloatArray
 
-Verdict = Literal["blank", "no dots", "too dark", "saturated", "dots merge", "low contrast", "good"]
+ExposureVerdict = Literal[
+    "blank", "no dots", "too dark", "saturated", "dots merge", "low contrast", "good"
+]
 
 CLIPPED_DOTS = 0.05
 """A frame is saturated if more than this share of its dots is clipped."""
@@ -33,7 +35,7 @@ MERGING = 0.4
 AROUND = 4.0
 """The background of a dot is the darkest place within this many distances to neighbours."""
 
-ADVICE: dict[Verdict, str] = {
+ADVICE: dict[ExposureVerdict, str] = {
     "blank": "All pixels are alike: is the shutter open, the camera connected?",
     "no dots": "No dot stands out: is the laser on, and the imaging plane in the picture?",
     "too dark": "The dots hardly leave the noise: expose longer, or open the lens.",
@@ -71,7 +73,7 @@ class Exposure:
     contrast: float
     snr: float
     valley: float
-    verdict: Verdict
+    verdict: ExposureVerdict
 
     @property
     def advice(self) -> str:
@@ -107,7 +109,7 @@ def judge_exposure(image: Image, dots: Dots | None, bit_depth: int | None) -> Ex
     part = float(_at(cv2.dilate(clipped.astype(np.float32), beside), dots.image_px).mean())
     contrast = float(np.clip(np.median(dots.peak / np.maximum(brightest, 1e-9)), 0.0, 1.0))
     snr, valley = float(np.median(dots.snr)), _valley(grey, dots)
-    verdict: Verdict = "good"
+    verdict: ExposureVerdict = "good"
     if part > CLIPPED_DOTS:
         verdict = "saturated"
     elif valley < MERGING:
@@ -117,7 +119,7 @@ def judge_exposure(image: Image, dots: Dots | None, bit_depth: int | None) -> Ex
     return Exposure(min(level, 1.0), part, contrast, snr, valley, verdict)
 
 
-def _without_dots(grey: Grey, level: float, clipped: float) -> Verdict:
+def _without_dots(grey: Grey, level: float, clipped: float) -> ExposureVerdict:
     if not np.ptp(grey) > 0:
         return "blank"
     if clipped > CLIPPED_PIXELS:

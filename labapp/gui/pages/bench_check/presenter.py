@@ -25,7 +25,7 @@ from labapp.core.bench_check.forecast import (
     forecast,
     height_sigma,
 )
-from labapp.core.bench_check.labelling import Picture
+from labapp.core.bench_check.labelling import MirrorDots
 from labapp.core.bench_check.mirrors import Cap
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
@@ -145,7 +145,7 @@ def check(
         except CannotMeasure as answer:
             raise CannotMeasure(answer.status, f"{one.name}: {answer.reason}") from answer
         rows, columns = one.image.shape
-        pictures.append(Picture(one.name, one.mirror, dots, (rows, columns)))
+        pictures.append(MirrorDots(one.name, one.mirror, dots, (rows, columns)))
     progress(len(chosen), parts, "adjusting the set-up")
     found = check_bench(pictures, setup.rig, setup.calibration, free)
     kept = []
