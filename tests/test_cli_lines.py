@@ -145,3 +145,15 @@ def test_current_needs_a_tracked_line(labapp: Run, setup: Path, tmp_path: Path):
     assert "volts.csv" in stderr
     code, _, _ = labapp(*arguments, "--follow", "--signals", str(tmp_path / "log.csv"))
     assert code == 1  # there is no line
+
+
+def test_options_of_dots_are_refused_for_a_session_of_lines(labapp: Run, tmp_path: Path):
+    sample = Path(__file__).parents[1] / "sample_sessions/five_lines/five_lines.labsession"
+    out = tmp_path / "out"
+    code, _, stderr = labapp("session", "export", sample, "--out", out, "--report", "--hdf5")
+    assert code == 2
+    assert "hdf5, report" in stderr
+    assert not out.exists()
+    code, _, _ = labapp("session", "export", sample, "--out", out)
+    assert code == 0
+    assert (out / "features.csv").is_file()

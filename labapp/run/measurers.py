@@ -52,7 +52,7 @@ OPEN_WAITS = 20
 """The most frames that wait for votes on a frame whose rows are ambiguous."""
 
 FOLLOWED_AT_ONCE = 400
-"""Frames whose pulses are classified together: some tens of periods."""
+"""The most frames whose pulses are classified together: some tens of periods."""
 
 STRETCH = 500
 """Frames of a stretch. A frame measured without tracking takes as long as ten to twenty tracked
@@ -231,12 +231,12 @@ class LineFollower:
     """Times in the recording (s) and weld current (A), each shape (n,); None: not recorded."""
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
-        """Measure frames; see `runner.Measurer`. Results come `FOLLOWED_AT_ONCE` at a time."""
+        """Measure frames; see `runner.Measurer`. Results come many at a time."""
         from labapp.core.lines.frame import LineFrame
         from labapp.core.lines.track import LineTracker, track_line
 
-        tracker, numbers = LineTracker(), iter(frames)
-        while chosen := list(islice(numbers, FOLLOWED_AT_ONCE)):
+        tracker = LineTracker()
+        for chosen in _classified_together(frames):
             begun = [
                 (number, _read(self.read, number, self.setup, self.settings)) for number in chosen
             ]
@@ -261,6 +261,21 @@ class LineFollower:
         if self.current is None:
             return None
         return np.asarray(np.interp(time_s, *self.current, left=np.nan, right=np.nan))
+
+
+def _classified_together(frames: Iterable[int]) -> Iterator[list[int]]:
+    """Divide frames into parts of `FOLLOWED_AT_ONCE`; the last two share the remainder equally.
+
+    A few remaining frames alone would not form two classes.
+    """
+    numbers = iter(frames)
+    part = list(islice(numbers, FOLLOWED_AT_ONCE))
+    while len(rest := list(islice(numbers, FOLLOWED_AT_ONCE))) == FOLLOWED_AT_ONCE:
+        yield part
+        part = rest
+    both = part + rest
+    half = -(-len(both) // 2) if rest else len(both)
+    yield from filter(None, (both[:half], both[half:]))
 
 
 # --- tracking from frame to frame ---------------------------------------------------------------

@@ -23,6 +23,11 @@ from labapp.session.frames import Progress
 from labapp.session.report import report_pdf
 from labapp.session.results.measured import Result, scheme_name
 
+CHOICES_OF_DOTS = (
+    "tables", "surfaces", "solid", "hdf5", "together", "pictures", "spacing_mm", "sigma_parts",
+)  # fmt: skip
+"""Fields of `ExportChoice` without effect on lines; the others are options of pictures."""
+
 
 def export_session(
     session: SessionContents,
@@ -37,12 +42,14 @@ def export_session(
     require(folder, PATH, "export", "folder", "the path of a folder")
     require(choice, ExportChoice, "export", "choice", "labapp.export.folder.ExportChoice")
     scheme = scheme or scheme_name(session.settings)
-    numbers = _current_frames(session, scheme, frames)
+    report_progress = progress or (lambda done, total: None)
     if session.has_lines:
-        return _export_lines(session, folder, scheme, numbers)
+        _refuse_choices_of_dots(choice, report)
+        numbers = _current_frames(session, scheme, frames)
+        return _export_lines(session, folder, scheme, numbers, report_progress)
+    numbers = _current_frames(session, scheme, frames)
     before = len(numbers) * report
     total = before + len(numbers) * (2 if "film" in choice.pictures else 1)
-    report_progress = progress or (lambda done, total: None)
 
     def write_report() -> bytes:
         return report_pdf(
@@ -95,12 +102,30 @@ def write_view_film(
         )
 
 
+def _refuse_choices_of_dots(choice: ExportChoice, report: bool) -> None:
+    """Refuse an export of lines with anything but the usual choice: only its tables exist."""
+    usual = ExportChoice()
+    chosen = [name for name in CHOICES_OF_DOTS if getattr(choice, name) != getattr(usual, name)]
+    if chosen := chosen + ["report"] * report:
+        right = "the usual choice: lines are exported as their tables, without options"
+        raise InputError("export", "choice", ", ".join(chosen), right)
+
+
 def _export_lines(
-    session: SessionContents, folder: str | os.PathLike[str], scheme: str, numbers: Sequence[int]
+    session: SessionContents,
+    folder: str | os.PathLike[str],
+    scheme: str,
+    numbers: Sequence[int],
+    report_progress: Progress,
 ) -> tuple[ExportedFile, ...]:
-    """Write the tables of a line pattern, the same as `labapp lines`."""
-    measured = of_lines(_Measured(session, scheme, numbers))
-    texts = line_tables(*measured, session.setup.calibration, session.setup_status)
+    """Write all tables of a pattern of lines, or of a followed line."""
+
+    def measured() -> Iterator[FrameResult]:
+        for done, result in enumerate(_Measured(session, scheme, numbers), 1):
+            yield result
+            report_progress(done, len(numbers))
+
+    texts = line_tables(*of_lines(measured()), session.setup.calibration, session.setup_status)
     return export(
         folder,
         (),

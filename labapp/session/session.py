@@ -642,7 +642,8 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If a result is stale, nothing was measured, or the folder cannot be written.
+            If a result is stale, nothing was measured, the folder cannot be written, or anything
+            but the usual choice is made for a pattern of lines: all its tables are written.
         """
         from labapp.export.folder import ExportChoice
         from labapp.session.outgoing import export_session

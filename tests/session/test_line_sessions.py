@@ -15,6 +15,7 @@ from labapp.core.geometry.line_pattern import LineRays
 from labapp.core.lines.states import State
 from labapp.core.rows.correction import Correction
 from labapp.errors import InputError
+from labapp.export.folder import ExportChoice
 from labapp.gui.pages.dots.line_presenter import show_lines
 from labapp.gui.pages.setup import presenter as setup_page
 from labapp.gui.pages.surface import presenter as surface_page
@@ -24,6 +25,8 @@ from labapp.session.session import Session
 from labapp.simulation.pools import Pool, egg
 from tests.line_truth.frames import LineLook, render_lines
 from tests.test_cli_lines import SETUP, VIEW
+
+FIVE_LINES = Path(__file__).parents[2] / "sample_sessions" / "five_lines" / "five_lines.labsession"
 
 POOL = egg(6.0, 2.8, 3.2, 0.3)
 
@@ -73,6 +76,36 @@ def test_export_of_lines_equals_the_output_of_the_command(session: Session, tmp_
         rows = list(csv.DictReader(file))
     assert [row["lines"] for row in rows] == ["0", "5"]
     assert rows[0]["state"] == "no-pool"
+
+
+@pytest.mark.parametrize(
+    ("choice", "report", "named"),
+    [
+        (ExportChoice(hdf5=True, pictures=frozenset({"trends"})), True, "hdf5, pictures, report"),
+        (ExportChoice(tables=frozenset({"dots"})), False, "tables"),
+        (ExportChoice(together=frozenset({"hdf5"})), False, "together"),
+        (ExportChoice(surfaces=frozenset(), sigma_parts=True), False, "surfaces, sigma_parts"),
+        (ExportChoice(solid=True, spacing_mm=0.2), False, "solid, spacing_mm"),
+    ],
+)
+def test_export_of_lines_refuses_what_only_dots_have(
+    tmp_path: Path, choice: ExportChoice, report: bool, named: str
+):
+    with (
+        Session.open(FIVE_LINES, read_only=True) as session,
+        pytest.raises(InputError) as refused,
+    ):
+        session.export(tmp_path / "out", choice, report=report)
+    assert refused.value.value == named
+    assert not (tmp_path / "out").exists()
+
+
+def test_export_of_lines_reports_progress(tmp_path: Path):
+    done = list[tuple[int, int]]()
+    with Session.open(FIVE_LINES, read_only=True) as session:
+        count = len(session.frames)
+        session.export(tmp_path / "out", progress=lambda *steps: done.append(steps))
+    assert done == [(k, count) for k in range(1, count + 1)]
 
 
 @pytest.mark.slow

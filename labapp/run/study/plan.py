@@ -158,7 +158,11 @@ def read_study(path: str | os.PathLike[str]) -> StudyPlan:
     """
     path = Path(path)
     read = _read_csv if path.suffix.lower() == ".csv" else _read_toml
-    top, entries = read(path)
+    return _plan(path, *read(path))
+
+
+def _plan(path: Path, top: Mapping[str, Any], entries: Sequence[tuple[str, Any]]) -> StudyPlan:
+    """Check the keys at the top and (location, keys) of each recording; see `read_study`."""
     problems: list[InputError] = []
     found: list[tuple[str, dict[str, Any], Path, dict[str, Condition]]] = []
     for where, entry in entries:
@@ -222,8 +226,8 @@ def write_study(
     Raises
     ------
     InputError
-        If the file exists already or cannot be written, a pattern matches nothing, or the set-up is
-        not valid.
+        If the file exists already or cannot be written, a pattern matches nothing, a recording or a
+        condition is refused, or the set-up is not valid. Nothing is written then.
     """
     path = Path(path)
     if path.suffix.lower() not in (".toml", ".csv"):
@@ -235,18 +239,20 @@ def write_study(
     read_setup(setup)  # otherwise each recording would fail by it
     folder = path.parent.absolute()
     found = [each for text in recordings for each in matching_recordings(text)]
-    names = list(dict.fromkeys(name for _, varied in found for name in varied))
+    bench = _relative(Path(setup), folder)
+    files = [(_relative(file, folder), varied) for file, varied in found]
     entries = [
-        {"file": _relative(file, folder), "setup": _relative(Path(setup), folder), **varied}
-        for file, varied in found
+        (f"recording[{k}]", {"file": file, "setup": bench, "conditions": varied})
+        for k, (file, varied) in enumerate(files, 1)
     ]
+    names = _plan(path, {}, entries).conditions
     if path.suffix.lower() == ".csv":
-        head = ["file", "setup", *names]
-        text = unescaped_csv_text([head, *([one.get(n, "") for n in head] for one in entries)])
+        rows = [[file, bench, *(varied.get(name, "") for name in names)] for file, varied in files]
+        text = unescaped_csv_text([["file", "setup", *names], *rows])
     else:
-        text = f"title = {_toml(path.stem)}\nsetup = {_toml(_relative(Path(setup), folder))}\n"
-        for (_, varied), entry in zip(found, entries, strict=True):
-            text += f"\n[[recording]]\nfile = {_toml(entry['file'])}\n"
+        text = f"title = {_toml(path.stem)}\nsetup = {_toml(bench)}\n"
+        for file, varied in files:
+            text += f"\n[[recording]]\nfile = {_toml(file)}\n"
             each = ", ".join(f"{name} = {_toml(value)}" for name, value in varied.items())
             text += f"conditions = {{ {each} }}\n" if each else ""
     write_file(path, as_bytes(text))
@@ -354,6 +360,9 @@ def _read_csv(path: Path) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
         if "file" not in header or twice:
             named = f"{shown(twice[0])} twice" if twice else head.strip() or "empty"
             raise InputError(path, "line 1", named, "the names of the columns, file among them")
+        if "conditions" in header:
+            each = "a column of its own for each condition"
+            raise InputError(path, "line 1", "conditions", each)
         for number, cells in enumerate(csv.reader(lines, delimiter=separator), 2):
             if not any(cells):
                 continue
@@ -402,6 +411,8 @@ def _wrong_condition(name: str) -> str | None:
         return "a name of letters, digits and _, a letter first, at most 50"
     if name.lower() in RESERVED:
         return "another name: results have a column of this one"
+    if name in OF_RECORDING:
+        return "another name: a key of each recording has this one"
     return None
 
 

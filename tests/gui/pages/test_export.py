@@ -127,6 +127,31 @@ def test_plan_explains_outdated_frames_and_lists_them(gtaw: Path) -> None:
         assert len(other.again) == 0
 
 
+def test_plan_of_lines_lists_what_is_written(copy_sample, tmp_path: Path) -> None:
+    everything = ExportRequest(ticked=frozenset({"report", "pictures:film", "together:hdf5"}))
+    with Session.open(copy_sample("five_lines"), read_only=True) as session:
+        planned = plan(session, everything, 0)
+        assert planned.why_not == ""
+        assert planned.locked.startswith("Lines")
+        assert planned.notes[0] == planned.locked
+        assert not any("film" in note for note in planned.notes)
+        frames = planned.frames.tolist()
+        written = write(session, everything, frames, tmp_path / "out", lambda *_: None)
+    assert written.problems == ()
+    names = [file.name for file in written.files]
+    tables = [name for name in names if not name.startswith("surface_")]
+    assert tables == sorted(["features.csv", "lines.csv", "line_points.csv"])
+    assert planned.files[:-1] == (
+        "features.csv",
+        "lines.csv",
+        "line_points.csv",
+        "edges.csv, if the solid metal shows the ends of lines",
+        f"surface_NNNNNN.csv ({len(names) - len(tables)} files)",
+    )
+    with Session.open(copy_sample("gtaw"), read_only=True) as session:
+        assert plan(session, everything, 0).locked == ""
+
+
 def test_folder_with_other_files_is_not_proposed(gtaw: Path, tmp_path: Path) -> None:
     with Session.open(gtaw, read_only=True) as session:
         assert proposed_folder(session) == gtaw.parent / "gtaw-results"
@@ -210,6 +235,20 @@ def test_select_all_and_none(page: ExportPage) -> None:
     none.click()
     assert not page.request.ticked
     assert not page.export_button.isEnabled()
+
+
+def test_choices_are_locked_for_lines(page: ExportPage, copy_sample) -> None:
+    box = page._boxes["pictures:film"]
+    box.click()
+    for name, locked in (("five_lines", True), ("blocked_rows", False)):
+        page.workspace.show(Session.open(copy_sample(name)))
+        page.refresh()
+        assert box.isEnabled() is not locked
+        assert box.isChecked() is not locked
+        assert box.toolTip().startswith("Lines") is locked
+        assert page.view.isEnabled() is not locked
+        assert page.spacing.isEnabled() is not locked
+        assert page.export_button.isEnabled()
 
 
 def test_cancelled_export_leaves_no_files(

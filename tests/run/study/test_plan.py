@@ -202,3 +202,39 @@ def test_new_study_file_contains_its_recordings(
     with pytest.raises(InputError):
         write_study(other, ["=odd.avi"], "bench.toml", replace=True)
     assert other.read_text() == "a = 1\n"
+
+
+@pytest.mark.parametrize("suffix", ["toml", "csv"])
+@pytest.mark.parametrize("key", ["file", "name", "setup", "frames", "warm", "conditions"])
+def test_key_of_a_study_is_no_name_of_a_condition(
+    tmp_path: Path, suffix: str, key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "I100_1.avi").touch()
+    shutil.copy(SAMPLES / "gtaw" / "setup.toml", tmp_path / "bench.toml")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=f"{{{key}}}"):
+        write_study(f"new.{suffix}", [f"I{{{key}}}_*.avi"], "bench.toml")
+    assert not Path(f"new.{suffix}").exists()
+    text = 'setup = "s"\n[[recording]]\nfile = "a.avi"\n'
+    with pytest.raises(InputError) as refused:
+        read_study(write(tmp_path, f"{text}conditions = {{ {key} = 1 }}"))
+    assert fields(refused) == {f"recording[1].conditions.{key}"}
+
+
+def test_column_of_conditions_is_refused(tmp_path: Path) -> None:
+    text = "file,setup,conditions\na.avi,bench.toml,argon\n"
+    with pytest.raises(InputError) as refused:
+        read_study(write(tmp_path, text, "study.csv"))
+    assert fields(refused) == {"line 1"}
+
+
+@pytest.mark.parametrize("name", ["new.toml", "new.csv"])
+def test_refused_study_is_not_written(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.avi").touch()
+    shutil.copy(SAMPLES / "gtaw" / "setup.toml", tmp_path / "bench.toml")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="each file once"):
+        write_study(name, ["a.avi", "a.avi"], "bench.toml")
+    assert not Path(name).exists()

@@ -63,6 +63,7 @@ class ExportPage(Page):
         self._said = ""
         self._in_view: int | None = None
         self._boxes: dict[str, QCheckBox] = {}
+        self._tips: dict[str, str] = {}
         self._make_canvas()
         self._make_panel()
         workspace.opened.connect(self._session_opened)
@@ -98,20 +99,32 @@ class ExportPage(Page):
         self.plan = made = plan(session, self.request, self.workspace.frame)
         self.files.setText("\n".join(made.files) or "Nothing is selected.")
         self.notes.setText("\n".join(made.notes))
-        self._boxes["solid"].setEnabled(self.request.has_mesh)
+        self._lock_choices(made.locked)
         part, drawn = self.request.which == "part", self.request.has_view
-        film = "film" in self.request.some("pictures")
+        pictures = self.request.some("pictures")
         # Disabled, not hidden, so that nothing below moves.
         for fields, used in (
             ((self.first, self.last, self.every), part),
-            ((self.view, self.picture_size), drawn),
-            ((self.rate,), film),
-            ((self.picture_format,), "frames" in self.request.some("pictures")),
+            ((self.spacing,), not made.locked),
+            ((self.view, self.picture_size), drawn and not made.locked),
+            ((self.rate,), "film" in pictures and not made.locked),
+            ((self.picture_format,), "frames" in pictures and not made.locked),
         ):
             for one in fields:
                 one.setEnabled(used)
                 one.label.setEnabled(used)
         self._show_state()
+
+    def _lock_choices(self, why: str) -> None:
+        """Disable and untick all boxes, with the reason; empty: show the ticks of the request."""
+        for key, box in self._boxes.items():
+            box.blockSignals(True)
+            box.setChecked(key in self.request.ticked and not why)
+            box.blockSignals(False)
+            box.setEnabled(not why and (key != "solid" or self.request.has_mesh))
+            box.setToolTip(why or self._tips[key])
+        for each in self._tick_buttons:
+            each.setEnabled(not why)
 
     def _show_state(self) -> None:
         made = self.plan
@@ -132,7 +145,8 @@ class ExportPage(Page):
             0 if recording is None else recording.rows * recording.columns,
         )
         about = format_bytes(float(f"{size:.2g}")).replace(".0 ", " ")
-        ready = f"{pluralize(len(made.frames), 'frame')} will be written, about {about}."
+        ready = f"{pluralize(len(made.frames), 'frame')} will be written"
+        ready += "." if made.locked else f", about {about}."
         wrong = f"{PROBLEM} {why_not}" if why_not and not writing else why_not or self._said
         self.answer.setText(wrong or ready)
         again = len(made.again) > 0 and not self.workspace.session.read_only
@@ -234,17 +248,18 @@ class ExportPage(Page):
             for item in items:
                 box = boxes[item.key]
                 box.setToolTip(item.tip)
+                self._tips[item.key] = item.tip
                 box.setChecked(item.key in USUAL)
                 box.toggled.connect(lambda _: self._ticked())
             self._boxes |= boxes
             grid.addLayout(vbox(heading(title), *boxes.values(), 1), number // 2, number % 2)
         self.files = wrapping_label()
         will = vbox(heading("The folder will contain"), self.files)
-        choose = hbox(
+        self._tick_buttons = (
             button("Select all", "Tick all that can be written", lambda: self._tick(True)),
             button("Select none", "Tick nothing", lambda: self._tick(False)),
-            1,
         )
+        choose = hbox(*self._tick_buttons, 1)
         choose.setSpacing(6)
         grid.addLayout(choose, 2, 0, 1, 2)
         grid.addLayout(will, 3, 0, 1, 2)

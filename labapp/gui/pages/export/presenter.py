@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,10 @@ from labapp.session.session import Session
 from labapp.text import format_bytes, marked_setup_words, pluralize
 
 REPORT_FILE = "report.pdf"
+MANIFEST_LINE = f"{MANIFEST}: source, set-up, versions, every file with its SHA-256"
+
+LINES = "Lines are exported as their tables; the choices are for patterns of dots."
+"""Reason why nothing can be chosen for a pattern of lines."""
 
 SHOWN_PROBLEMS = 5
 
@@ -186,6 +190,8 @@ class ExportPlan:
     """Chosen frames that are stale or unmeasured, shape (k,)."""
     why_not: str
     """Reason why nothing can be written; empty if it can."""
+    locked: str
+    """Reason why the files cannot be chosen; empty if they can."""
     notes: tuple[str, ...]
     """Further notes, a sentence each."""
     files: tuple[str, ...]
@@ -193,12 +199,14 @@ class ExportPlan:
     surfaces: int
     """Number of frames with a surface."""
     area_mm2: float
-    """Mean area of the surfaces; 0 without any."""
+    """Mean area of the surfaces; 0 without any, and of lines."""
 
 
 def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
     """Plan of an export, and the reason if it is impossible."""
     own = scheme_name(session.settings)
+    locked = LINES if session.has_lines else ""
+    request = replace(request, ticked=USUAL) if locked else request
     scheme = request.scheme or own
     seen = session.overview(scheme)
     chosen = _chosen(seen.frame, request, frame)
@@ -207,7 +215,7 @@ def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
     stale = seen.frame[measured & seen.stale]
     unmeasured = seen.frame[chosen & (status == "")]
     surfaces = int((measured & (status == "ok")).sum())
-    notes = []
+    notes = [locked]
     if len(seen.frame[measured]):
         notes.append(marked_setup_words(session.setup_status, session.setup_words))
     if len(unmeasured):
@@ -222,16 +230,20 @@ def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
     if "film" in request.some("pictures") and surfaces:
         notes.append(film_note(seen.frame[measured], seen.time_s[measured], request.film_rate_hz))
     frames = seen.frame[measured]
+    files = _files_of_lines(session, surfaces) if locked else _files(request, len(frames), surfaces)
     again = np.union1d(stale, unmeasured) if scheme == own else np.zeros(0, np.int64)
     return ExportPlan(
         scheme=scheme,
         frames=frames,
         again=np.asarray(again, np.int64),
         why_not=_why_not(session, request, scheme, frames, stale),
+        locked=locked,
         notes=tuple(filter(None, notes)),
-        files=_files(request, len(frames), surfaces),
+        files=(*files, MANIFEST_LINE) if len(frames) else (),
         surfaces=surfaces,
-        area_mm2=float(np.nanmean(seen.measures["area_mm2"][measured])) if surfaces else 0.0,
+        area_mm2=0.0
+        if locked or not surfaces
+        else float(np.nanmean(seen.measures["area_mm2"][measured])),
     )
 
 
@@ -278,9 +290,20 @@ def _why_not(
     return ""
 
 
-def _files(request: ExportRequest, count: int, surfaces: int) -> tuple[str, ...]:
-    if not count:
-        return ()
+def _files_of_lines(session: Session, surfaces: int) -> list[str]:
+    """Return the tables of a pattern of lines, as `labapp.export.line_results.line_tables`."""
+    lines = ["features.csv", "lines.csv", "line_points.csv"]
+    rig = None if session.setup_problems else session.setup.line_rig
+    if rig is not None and rig.pattern.count == 1:
+        return [*lines, "track.csv"]
+    lines.append("edges.csv, if the solid metal shows the ends of lines")
+    if surfaces:
+        lines.append(f"surface_NNNNNN.csv ({pluralize(surfaces, 'file')})")
+    return lines
+
+
+def _files(request: ExportRequest, count: int, surfaces: int) -> list[str]:
+    """Return the files of a pattern of dots."""
     lines = [f"{name}.csv" for name in ("measures", "dots", "points", "boundary")]
     lines = [line for line in lines if line.removesuffix(".csv") in request.some("tables")]
     formats = request.some("surfaces")
@@ -299,7 +322,7 @@ def _files(request: ExportRequest, count: int, surfaces: int) -> tuple[str, ...]
     whole = request.some("together")
     lines += [each.file for name, each in RUN_FORMATS.items() if name in whole]
     lines += [REPORT_FILE] * ("report" in request.ticked)
-    return (*lines, f"{MANIFEST}: source, set-up, versions, every file with its SHA-256")
+    return lines
 
 
 def _named(scheme: str) -> str:
@@ -359,6 +382,8 @@ def write(
     progress: Progress,
 ) -> Written:
     """Export, then read all files again and compare them with the manifest."""
+    if session.has_lines:
+        request = replace(request, ticked=USUAL, spacing_mm=SPACING_MM)
     # The report's matrices are small, so several threads would slow each other down.
     with threadpool_limits(limits=1, user_api="blas"):
         files = session.export(
