@@ -38,6 +38,14 @@ HOW: dict[str, Any] = {
 }
 """Sums may be reordered; division by zero gives infinity or NaN, as in NumPy."""
 
+FLOAT, INT = types.float64, types.int64
+FLOATS_1, FLOATS_2, FLOATS_3 = (types.Array(FLOAT, n, "A", readonly=True) for n in (1, 2, 3))
+INTS_1 = types.Array(INT, 1, "A", readonly=True)
+BOOLS_1 = types.Array(types.boolean, 1, "A", readonly=True)
+BAND = types.Array(FLOAT, 2, "F", readonly=True)
+"""Types of arguments for `compiled`: arrays of so many dimensions that are only read, of any layout
+but for `BAND`, whose columns follow on each other in memory."""
+
 NOTICES = "labapp.notices"
 """Logger of messages for a waiting user; `labapp.log` shows them on stderr."""
 

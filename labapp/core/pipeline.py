@@ -3,8 +3,8 @@
 1. `tuned_dots`, or `find_dots` for another detector: the reflected dots of the frame (§5.2.1).
 2. `find_lattice`: their rows and columns in the picture, as far as they can be determined (§5.2.2).
 3. `match_rays`: which ray made which dot (§4.2.2); then rows and columns are those of the rays.
-4. `fit.solve`, or `reconstruct` for another scheme: the pool's surface (ch. 6, 7).
-5. `fit.complete`, or `measure_surface` for another scheme: its size and reflection errors
+4. `fit.fit_surface`, or `reconstruct` for another scheme: the pool's surface (ch. 6, 7).
+5. `fit.bound_and_measure`, or `measure_surface` for another scheme: its size and reflection errors
    (Eq. 6-3 … 6-8); with fit also its boundary.
 
 If the operator corrected the frame, the corrected dots and rows replace the results of steps 1
@@ -244,9 +244,9 @@ def measure(
         result = replace(result, match=match, lattice=lattice)
         if settings.scheme != "fit":
             return _by_scheme(result, match, rig, settings), None
-        pool = tracked.pool if tracked else fit.solve(match, rig, settings.fit, initial)
+        pool = tracked.pool if tracked else fit.fit_surface(match, rig, settings.fit, initial)
         on_step("surface")
-        reconstruction, measured = fit.complete(match, pool, rig, settings.fit, known)
+        reconstruction, measured = fit.bound_and_measure(match, pool, rig, settings.fit, known)
     except CannotMeasure as why:
         return _refused(result, why), None
     on_step("measures")

@@ -21,7 +21,7 @@ COMPILED = (
     "labapp.core.rows.lattice_kernels",
     *(
         f"labapp.core.surface.kernels.{name}_kernels"
-        for name in ("spline", "ray", "solver", "outline", "level", "round", "setup", "shape")
+        for name in ("spline", "ray", "solver", "boundary", "level", "rounds", "setup", "shape")
     ),
     "labapp.core.matching.match_kernels",
     "labapp.core.matching.initial.quadric_kernels",

@@ -173,8 +173,8 @@ def fitted_frames(pool, count, rate_hz, rng):
         per_dot = ("ray", "dot", "reflected", "plane_mm", "plane_covariance_mm2")
         remaining = {name: getattr(match, name)[present] for name in per_dot}
         match = replace(match, witness=witness, **remaining)
-        fitted = fit.solve(match, OPEN_RIG, FitSettings(), near)
-        reconstruction, sizes = fit.complete(match, fitted, OPEN_RIG, FitSettings())
+        fitted = fit.fit_surface(match, OPEN_RIG, FitSettings(), near)
+        reconstruction, sizes = fit.bound_and_measure(match, fitted, OPEN_RIG, FitSettings())
         near = fitted.surface
         yield k, k / rate_hz, reconstruction.unbounded, reconstruction.boundary, vars(sizes)
 

@@ -10,8 +10,9 @@ import pytest
 from labapp.core.geometry.optics import direction_to_dots, intersect_imaging_plane
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.pipeline import Settings, reconstruct
-from labapp.core.surface.kernels import solver_kernels, spline_kernels
+from labapp.core.surface.kernels import solver_kernels
 from labapp.core.surface.measures import measure_surface
+from labapp.core.surface.spline import SplineBasis
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg
 
@@ -76,15 +77,16 @@ def test_kernels_agree_with_numpy():
     )
     slopes = POOL.gradient(*points[:, :2].T)
     weights = np.tile(np.eye(2), (len(points), 1, 1))
-    grid = np.array([[-6.0, 6.0, 1.0, 12.0], [-6.0, 6.0, 1.0, 12.0]])
+    basis = SplineBasis.over(np.full(2, -6.0), np.full(2, 6.0), 1.0)
     dots_mm = (plane.to_universal(reflections.plane_mm[reflections.visible]),)
     # The slopes that the dots imply are those of the pool.
     right_side = solver_kernels.gradient_rhs(
-        grid, np.zeros(225), points, weights, RIG.laser.position_mm, plane.pose_mm, *dots_mm
+        basis.grid, np.zeros(225), points, weights, RIG.laser.position_mm, plane.pose_mm, *dots_mm
     )
-    flat = spline_kernels.splines_at(grid, points)
+    cells = basis.cells(*points[:, :2].T)
+    _, *by_slope = cells.value_and_slopes()
     expected = np.zeros(225)
-    for spline, by_x, by_y, (x, y) in zip(flat[0], flat[1][1], flat[1][2], slopes, strict=True):
+    for spline, by_x, by_y, (x, y) in zip(cells.splines, *by_slope, slopes, strict=True):
         np.add.at(expected, spline, by_x * x + by_y * y)
     np.testing.assert_allclose(right_side, expected, atol=1e-8)
     assert len(incident) > 50

@@ -35,8 +35,8 @@ from labapp.core.matching import match_kernels
 from labapp.core.matching.initial import quadric_kernels
 from labapp.core.sequence.prior import RIDGE, recurrence
 from labapp.core.surface.kernels import (
+    boundary_kernels,
     level_kernels,
-    outline_kernels,
     ray_kernels,
     solver_kernels,
     spline_kernels,
@@ -79,10 +79,10 @@ def test_splines_and_surfaces_agree_with_the_basis() -> None:
     # Points outside the rectangle are moved to its edge.
     xy = random().uniform(BASIS.low_mm - 0.5, BASIS.high_mm + 0.5, (200, 2))
     inside = np.clip(xy, BASIS.low_mm, BASIS.high_mm)
-    splines, values = spline_kernels.splines_at(BASIS.grid, xy)
-    for value, (dx, dy) in zip(values, ((0, 0), (1, 0), (0, 1)), strict=True):
+    cells = BASIS.cells(*inside.T)
+    for value, (dx, dy) in zip(cells.value_and_slopes(), ((0, 0), (1, 0), (0, 1)), strict=True):
         matrix = np.zeros((len(xy), COUNT))
-        np.put_along_axis(matrix, splines, value, axis=1)
+        np.put_along_axis(matrix, cells.splines, value, axis=1)
         np.testing.assert_allclose(matrix, BASIS.matrix(*inside.T, dx, dy), atol=1e-12)
     computed = spline_kernels.surface_at(BASIS.grid, surface().coefficients, xy)
     height, gradient = surface().height_and_gradient(*inside.T)
@@ -160,7 +160,7 @@ def test_dot_covariance_is_propagated_from_the_coefficients() -> None:
     rng = random()
     points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
     weights = np.tile(np.diag([4e4, 1e4]), (60, 1, 1))
-    factor = normal_factor(BASIS, 10.0 * BASIS.roughness, points, weights)
+    factor = normal_factor(BASIS, 10.0 * BASIS.roughness_matrix, points, weights)
     lower = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(factor))
     dot_points, plane_mm = points[:7], rng.uniform([10.0, 10.0], [80.0, 60.0], (7, 2))
     inverse = solver_kernels.inverse_band(factor)
@@ -178,7 +178,7 @@ def test_dot_covariance_is_propagated_from_the_coefficients() -> None:
 def test_height_sigma_is_propagated_from_the_coefficients() -> None:
     points = random().uniform(BASIS.low_mm, BASIS.high_mm, (60, 2))
     weights = np.tile(np.diag([4e4, 1e4]), (60, 1, 1))
-    factor = normal_factor(BASIS, 10.0 * BASIS.roughness, points, weights)
+    factor = normal_factor(BASIS, 10.0 * BASIS.roughness_matrix, points, weights)
     places = random().uniform(BASIS.low_mm, BASIS.high_mm, (7, 2))
     mean = mean_splines(BASIS, points)
     np.testing.assert_allclose(mean, BASIS.matrix(*points.T).mean(axis=0), atol=1e-15)
@@ -239,7 +239,7 @@ def test_normal_equations_are_those_of_least_squares() -> None:
     slope_matrix = np.stack(
         [BASIS.matrix(*points[:, :2].T, 1, 0), BASIS.matrix(*points[:, :2].T, 0, 1)], 1
     )
-    band = 0.1 * BASIS.roughness
+    band = 0.1 * BASIS.roughness_matrix
     rough = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(band))
     rough += np.tril(rough, -1).T
     normal = np.einsum("nap,nab,nbq->pq", slope_matrix, weights, slope_matrix) + rough
@@ -254,7 +254,9 @@ def test_normal_equations_are_those_of_least_squares() -> None:
     right = rng.normal(size=(2, COUNT))
     solved = np.linalg.solve(lower @ lower.T, right.T).T
     np.testing.assert_allclose(solver_kernels.solve(factor, right), solved, rtol=1e-6)
-    indefinite = solver_kernels.normal_factor(BASIS.grid, -1e3 * BASIS.roughness, points, weights)
+    indefinite = solver_kernels.normal_factor(
+        BASIS.grid, -1e3 * BASIS.roughness_matrix, points, weights
+    )
     assert not indefinite[1]
     dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
     required = bisecting_gradient(points - LASER, dots_mm - points)
@@ -274,7 +276,7 @@ def test_fit_step_solves_normal_equations_and_keeps_mean_height() -> None:
     weights = np.tile(np.diag([4e4, 1e4]), (60, 1, 1))
     dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
     coefficients, rough = surface().coefficients, rng.normal(0.0, 0.1, COUNT)
-    band = 10.0 * BASIS.roughness
+    band = 10.0 * BASIS.roughness_matrix
     factor = normal_factor(BASIS, band, points, weights)
     half = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(band))
     right = solver_kernels.gradient_rhs(
@@ -698,7 +700,7 @@ def test_boundary_is_where_the_surface_meets_the_level(drop_mm: float) -> None:
     theta = np.linspace(-np.pi, np.pi, 48, endpoint=False)
     directions = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     center, rear = np.array([0.1, -0.4]), Rear(drop_mm, -1.0, -4.5)
-    radius, boundary_slope, over = outline_kernels.newton_to_boundary(
+    radius, boundary_slope, over = boundary_kernels.newton_to_boundary(
         BASIS.grid, surface().coefficients, np.array([drop_mm, -1.0, -4.5]), center, directions,
         np.full(48, 3.0), np.full(48, 0.3), 1e-10,
     )  # fmt: skip
@@ -773,7 +775,7 @@ def test_quadrics_are_fitted_to_dots(lit: list[int]) -> None:
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.004, 0.3])
-@pytest.mark.parametrize("witnesses", [1, 90, 2 * level_kernels.FACTORS + 7])
+@pytest.mark.parametrize("witnesses", [1, 90, 2 * level_kernels.RAYS_PER_LOG + 7])
 def test_level_likelihood_agrees_with_numpy(witnesses: int, missing: float) -> None:
     # Some heights are so far off that a plain exponential would overflow; one has no slope.
     over = random().normal(0.0, 0.1, (3, witnesses))

@@ -77,7 +77,7 @@ def match() -> Match:
 def test_contour_is_between_lit_and_dark_rays(sign: int, seed: int) -> None:
     landing, witness = rays_landing(0.45, seed)
     level = level_of(landing, witness, 0.45, sign)
-    assert level.sign == sign
+    assert level.pool_sign == sign
     height = sign * (dome(sign).height(*landing.T) + level.shift_mm)
     assert height[witness > 0].min() > height[witness < 0].max()
     assert height[witness > 0].min() > -level.sigma_mm
@@ -107,7 +107,7 @@ def test_single_false_witness_hardly_moves_the_level(lies: str) -> None:
     witness = witness.copy()
     witness[flipped] *= -1
     level = level_of(landing, witness, 0.45)
-    assert level.sign == 1
+    assert level.pool_sign == 1
     # A ray's spacing is 0.3 × 0.45 mm of height at the contour.
     assert abs(level.shift_mm - original.shift_mm) < 0.15 * 0.3 * 0.45
     assert level.sigma_mm > original.sigma_mm
@@ -278,7 +278,7 @@ def test_level_is_found_wherever_the_search_begins(off_mm: float) -> None:
     height, slope = dome().height_and_gradient(*landing.T)
     seen = np.stack([height, 0 * height]), slope, landing[:, 1], witness
     known = find_level(*seen, np.array([0.45, 0.45]))
-    about = known.shift_mm + off_mm, known.sign, 0.3
+    about = known.shift_mm + off_mm, known.pool_sign, 0.3
     found = find_level(*seen, np.array([0.45, 0.45]), about=about)
     assert found.shift_mm == pytest.approx(known.shift_mm, abs=0.2 * known.sigma_mm)
     assert found.sigma_mm == pytest.approx(known.sigma_mm, rel=0.2)
@@ -301,12 +301,14 @@ def test_rear_sinks_although_no_dark_ray_is_seen_there() -> None:
         witness = match.witness.copy()
         witness[(witness < 0) & (np.arange(1, 20)[:, None] < match.ray[:, 0].min() + 2)] = 0
         match = replace(match, witness=witness)
-        fitted = fit.solve(match, OPEN_RIG, FitSettings())
-        made, found = fit.complete(match, fitted, OPEN_RIG, FitSettings())
+        fitted = fit.fit_surface(match, OPEN_RIG, FitSettings())
+        made, found = fit.bound_and_measure(match, fitted, OPEN_RIG, FitSettings())
         assert (fitted.level.rear.drop_mm > 0.03) == (drop_mm > 0)
         assert abs(found.length_mm - pool.size.length_mm) < 2.5 * found.length_sigma_mm
         given = replace(fitted.level, drop_sigma_mm=0.0, drop_covariance_mm2=0.0)
-        certain, _ = fit.complete(match, replace(fitted, level=given), OPEN_RIG, FitSettings())
+        certain, _ = fit.bound_and_measure(
+            match, replace(fitted, level=given), OPEN_RIG, FitSettings()
+        )
         less = certain.size_sigma_level < made.size_sigma_level
         assert less[WITH_SIGMA.index("length_mm")]
         assert not less[WITH_SIGMA.index("height_mm")]

@@ -34,7 +34,7 @@ MATCH = exact_match(trace(egg(6.6, 3.0, 3.9, 0.33), RIG), RIG)
 
 
 def changes(pool: FittedPool | None = None) -> FloatArray:
-    pool = pool or fit.solve(MATCH, RIG, SETTINGS)
+    pool = pool or fit.fit_surface(MATCH, RIG, SETTINGS)
     basis, coefficients, points = pool.surface.basis, pool.surface.coefficients, pool.points_mm
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
     boundary, slope = trace_boundary(basis, coefficients, pool.level, center)
@@ -78,7 +78,7 @@ def test_changes_agree_with_fits_on_perturbed_benches(key: str) -> None:
 
 def test_changes_do_not_depend_on_a_reused_factor() -> None:
     """Here the points have moved by the largest distance for which a factor is reused."""
-    pool = fit.solve(MATCH, RIG, SETTINGS)
+    pool = fit.fit_surface(MATCH, RIG, SETTINGS)
     moved = pool.points_mm + REUSE_MM * np.sin(np.arange(pool.points_mm.size)).reshape(-1, 3)
     dots = MATCH.plane_mm, MATCH.plane_covariance_mm2
     basis = pool.surface.basis
@@ -91,7 +91,7 @@ def test_changes_do_not_depend_on_a_reused_factor() -> None:
 
 
 def test_exact_bench_has_no_changes() -> None:
-    rig, pool = replace(RIG, uncertainty=None), fit.solve(MATCH, RIG, SETTINGS)
+    rig, pool = replace(RIG, uncertainty=None), fit.fit_surface(MATCH, RIG, SETTINGS)
     gradient = np.ones((6, len(pool.surface.coefficients)))
     assert setup_changes(MATCH, rig, SETTINGS, pool, gradient).shape == (6, 0)
 
@@ -102,10 +102,10 @@ def test_residual_changes_agree_with_fits_on_perturbed_benches(key: str) -> None
     assert RIG.uncertainty is not None
     offset = 0.1 * RIG.uncertainty.root[:, INDEX[key]]
     dots = MATCH.plane_mm, MATCH.plane_covariance_mm2
-    pool = fit.solve(MATCH, RIG, SETTINGS)
+    pool = fit.fit_surface(MATCH, RIG, SETTINGS)
     change = residual_changes(MATCH, RIG, SETTINGS, pool)[..., INDEX[key]]
     more, less = (
-        fit.solve(
+        fit.fit_surface(
             replace(MATCH, plane_mm=moved_dots(dots[0], RIG, RIG.uncertainty.axes, vector)),
             moved_rig(RIG, vector),
             SETTINGS,

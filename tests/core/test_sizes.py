@@ -41,7 +41,7 @@ def test_sizes_agree_with_dense_sampling(sign: int, drop_mm: float, dent_mm: flo
     level = Level(0.0, 0.001, sign, Rear(drop_mm, -1.0, -3.2), 0.0)
     sizes, boundary = measured(splines, level)
     expected, peak = measures.surface_sizes(SplineSurface(BASIS, splines), boundary)
-    assert (np.abs(sizes.size - expected) < [1e-9, 1e-9, 1e-5, 1e-5, 1e-9, 2e-4]).all()
+    assert (np.abs(sizes.values - expected) < [1e-9, 1e-9, 1e-5, 1e-5, 1e-9, 2e-4]).all()
     np.testing.assert_allclose(sizes.peak_mm, peak, atol=1e-3)
     assert sizes.holds
 
@@ -64,7 +64,7 @@ def test_derivatives_agree_with_differences(drop_mm: float) -> None:
     for spline in np.random.default_rng(5).choice(len(splines), 25, replace=False):
         change = np.zeros_like(splines)
         change[spline] = step
-        more, less = (measured(splines + sign * change, level)[0].size for sign in (1, -1))
+        more, less = (measured(splines + sign * change, level)[0].values for sign in (1, -1))
         error = sizes.gradient[:, spline] - (more - less) / (2 * step)
         assert np.abs(np.delete(error, DEPTH)).max() < 2e-3
 
@@ -108,7 +108,7 @@ def test_derivatives_by_the_drop_agree_with_differences(drop_mm: float) -> None:
         assert boundary is not None
         sizes = sizes_and_gradients(BASIS, splines, level, boundary, slope)
         shape, by_shape = shape_and_gradients(BASIS, splines, level.rear, boundary, slope)
-        return np.append(sizes.size, shape), np.concatenate([sizes.gradient, by_shape])[:, -1]
+        return np.append(sizes.values, shape), np.concatenate([sizes.gradient, by_shape])[:, -1]
 
     gradient = sized(drop_mm)[1]
     moved = (sized(drop_mm + step)[0] - sized(drop_mm - step)[0]) / (2 * step)

@@ -65,7 +65,7 @@ def test_derivatives_agree_with_central_differences(dx: int, dy: int) -> None:
 
 def roughness() -> FloatArray:
     """Return the full symmetric matrix of the band."""
-    lower = sum(np.diag(line[: len(line) - k], -k) for k, line in enumerate(BASIS.roughness))
+    lower = sum(np.diag(line[: len(line) - k], -k) for k, line in enumerate(BASIS.roughness_matrix))
     return np.asarray(lower + np.tril(lower, -1).T)
 
 

@@ -212,7 +212,7 @@ def _quadric_basis(basis: SplineBasis) -> FloatArray:
         np.linspace(low, high, 12) for low, high in zip(basis.low_mm, basis.high_mm, strict=True)
     )
     x, y = (each.ravel() for each in np.meshgrid(x, y))
-    rough = _dense(basis.roughness)
+    rough = _dense(basis.roughness_matrix)
     rows = basis.matrix(x, y)
     return np.asarray(
         np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ _monomials(x, y)), np.float64
@@ -322,7 +322,7 @@ def _refined(start: _Hypothesis, data: LineData) -> tuple[LineSurface, float]:
     rows = basis.matrix(x, y)
     place = np.stack([x, y, np.zeros_like(x)], axis=-1)
     height, _ = start.model.surface_at(start.coefficients, place)
-    rough = _dense(basis.roughness)
+    rough = _dense(basis.roughness_matrix)
     first: FloatArray = np.asarray(
         np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ height), np.float64
     )

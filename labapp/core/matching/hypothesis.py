@@ -190,7 +190,7 @@ def _outside(observed: Observation, hypothesis: Hypothesis) -> IntArray:
     x, y = observed.rays.landing_mm[at[:, 0], at[:, 1], :2].T
     height, slope = hypothesis.pool.surface.height_and_gradient(x, y)
     level = hypothesis.pool.level
-    inward = level.sign * (height - level.rear.height(y))
+    inward = level.pool_sign * (height - level.rear.height(y))
     far = inward < -BEYOND_SPACINGS * np.linalg.norm(slope * observed.rays.spacing_mm, axis=-1)
     return np.asarray(at[far])
 

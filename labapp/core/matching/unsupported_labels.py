@@ -187,7 +187,7 @@ def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> Floa
     at = np.argwhere(lit & ~match_kernels.between(lit))
     landing, coefficients = observed.rays.landing_mm[tuple(at.T)], fitted.paths.coefficients
     height = spline_kernels.surface_at(fitted.basis.grid, coefficients, landing)[0]
-    outside = level.sign * (height - level.rear.height(landing[:, 1])) < 0.0
+    outside = level.pool_sign * (height - level.rear.height(landing[:, 1])) < 0.0
     odds = np.ones(len(at))  # the surface may go up there for the dot alone
     for k in np.flatnonzero(outside):
         nats = []

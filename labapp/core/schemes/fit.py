@@ -23,7 +23,6 @@ from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 UNSETTLED_MM = 0.02
 """The fit has not converged if a reflection point still moves by this in the last round."""
 
-
 CHANGED = 0.1
 """The set-up's part of the uncertainty is recomputed if a size differs by more than this share from
 those for which it was computed."""
@@ -61,19 +60,19 @@ def nearest_part(parts: tuple[SetupPart, ...], sizes: FloatArray) -> SetupPart |
 
 
 @dataclass(frozen=True)
-class Known:
-    """Quantities known from the previous frame.
+class FromPrevious:
+    """What the previous frame, and those before it, give for the next.
 
     Parameters
     ----------
     boundary
-        Its boundary.
-    by_setup
+        The boundary of the previous frame.
+    setup_parts
         The set-up's part of the uncertainty, as computed earlier for some sizes.
     """
 
     boundary: Boundary
-    by_setup: tuple[SetupPart, ...]
+    setup_parts: tuple[SetupPart, ...]
 
 
 def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction:
@@ -82,12 +81,14 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
     Raises
     ------
     CannotMeasure
-        As `solve`; ``open-boundary`` if the surface does not come down to the work piece all round.
+        As `fit_surface`; ``open-boundary`` if the surface does not come down to the work piece all
+        round.
     """
-    return complete(match, solve(match, rig, settings), rig, settings)[0]
+    pool = fit_surface(match, rig, settings)
+    return bound_and_measure(match, pool, rig, settings)[0]
 
 
-def solve(
+def fit_surface(
     match: Match, rig: Rig, settings: FitSettings, initial: SplineSurface | None = None
 ) -> FittedPool:
     """Fit the surface (`fit_pool`), starting from an initial one if given.
@@ -110,8 +111,12 @@ def solve(
     return pool
 
 
-def complete(
-    match: Match, pool: FittedPool, rig: Rig, settings: FitSettings, known: Known | None = None
+def bound_and_measure(
+    match: Match,
+    pool: FittedPool,
+    rig: Rig,
+    settings: FitSettings,
+    previous: FromPrevious | None = None,
 ) -> tuple[Reconstruction, measures.Measures]:
     """Compute the boundary, the sizes and all uncertainties of a fitted surface.
 
@@ -123,23 +128,26 @@ def complete(
     basis, coefficients, level = pool.surface.basis, pool.surface.coefficients, pool.level
     points = pool.points_mm
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
-    if known is None:
+    if previous is None:
         boundary, slope = trace_boundary(basis, coefficients, level, center)
     else:
-        boundary, slope = retrace_boundary(basis, coefficients, level, center, known.boundary)
+        boundary, slope = retrace_boundary(basis, coefficients, level, center, previous.boundary)
     sizes = sizes_and_gradients(basis, coefficients, level, boundary, slope)
-    if known is not None and not sizes.holds:
+    if previous is not None and not sizes.holds:
         raise CannotMeasure(
             "open-boundary", "the surface comes down to the work piece within its boundary"
         )
-    shape, by_shape = shape_and_gradients(basis, coefficients, level.rear, boundary, slope)
+    shape_parameters, by_shape = shape_and_gradients(
+        basis, coefficients, level.rear, boundary, slope
+    )
     gradient, by_drop = np.split(np.concatenate([sizes.gradient, by_shape]), [-1], axis=1)
-    by_level = level.sigma_of(gradient.sum(axis=1), by_drop[:, 0])
-    former = None if known is None else nearest_part(known.by_setup, sizes.size)
+    # The splines add up to 1: the sum is the derivative by the shift.
+    level_sigma = level.sigma_of(gradient.sum(axis=1), by_drop[:, 0])
+    former = None if previous is None else nearest_part(previous.setup_parts, sizes.values)
     if former is not None:
-        by_setup = former.sigma
+        sigma_of_setup = former.sigma
     else:
-        by_setup = setup_sigma(setup_changes(match, rig, settings, pool, gradient))
+        sigma_of_setup = setup_sigma(setup_changes(match, rig, settings, pool, gradient))
     reconstruction = Reconstruction(
         scheme="fit",
         surface=pool.surface,
@@ -148,12 +156,12 @@ def complete(
         points_mm=points,
         residual_mm=pool.residual_mm,
         sigma_mm=np.hypot(pool.height_sigma_mm(points), level.sigma_mm),
-        size_sigma=np.sqrt(pool.sigma_of(gradient) ** 2 + by_level**2 + by_setup**2),
-        size_sigma_level=by_level,
-        size_sigma_setup=by_setup,
+        size_sigma=np.sqrt(pool.sigma_of(gradient) ** 2 + level_sigma**2 + sigma_of_setup**2),
+        size_sigma_level=level_sigma,
+        size_sigma_setup=sigma_of_setup,
     )
     errors = measures.reflection_errors(reconstruction, match, rig)
-    sizes_and_shape = np.append(sizes.size, shape)
+    sizes_and_shape = np.append(sizes.values, shape_parameters)
     return reconstruction, measures.assemble_measures(
         errors, sizes_and_shape, sizes.peak_mm, center, reconstruction
     )

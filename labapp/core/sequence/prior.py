@@ -13,7 +13,7 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.images.band_pass import DetectorTuning
 from labapp.core.match import Match
 from labapp.core.matching.prediction import RayPaths
-from labapp.core.schemes.fit import UNSETTLED_MM, Known, SetupPart, nearest_part
+from labapp.core.schemes.fit import UNSETTLED_MM, FromPrevious, SetupPart, nearest_part
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.level import Level
 from labapp.core.surface.measures import Measures
@@ -162,9 +162,9 @@ class Prior:
         """Whether the part of the set-up is recomputed in the next frame, whatever its sizes."""
         return self.count % SETUP_EVERY == SETUP_EVERY - 1
 
-    def known(self) -> Known:
+    def known(self) -> FromPrevious:
         """Quantities known for the next frame; slowly changing ones are recomputed at intervals."""
-        return Known(self.boundary, () if self.setup_is_due else self.by_setup)
+        return FromPrevious(self.boundary, () if self.setup_is_due else self.by_setup)
 
     def after_gap(self) -> Prior:
         """Build the prior after a frame that was not measured: only the last surface is kept."""

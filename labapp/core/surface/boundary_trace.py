@@ -53,7 +53,7 @@ def trace_boundary(
     CannotMeasure
         ``open-boundary`` if the surface does not reach it in some direction within its rectangle.
     """
-    from labapp.core.surface.kernels import outline_kernels, spline_kernels
+    from labapp.core.surface.kernels import boundary_kernels, spline_kernels
 
     theta = np.linspace(-np.pi, np.pi, DIRECTIONS, endpoint=False)
     way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
@@ -62,7 +62,7 @@ def trace_boundary(
     reach = limit[:, None] * np.linspace(0.0, 1.0, CELLS + 1)
     place = center_mm + reach[..., None] * way[:, None]
     height = spline_kernels.surface_at(basis.grid, coefficients, place.reshape(-1, 2))[0]
-    inside = level.sign * (height.reshape(reach.shape) - level.rear.height(place[..., 1])) > 0
+    inside = level.pool_sign * (height.reshape(reach.shape) - level.rear.height(place[..., 1])) > 0
     # The centre of a dented pool may lie below the work piece: start at the first point inside.
     entered = np.cumsum(inside, axis=1) > 0
     crossing = entered[:, :-1] & inside[:, :-1] & ~inside[:, 1:]
@@ -73,7 +73,7 @@ def trace_boundary(
     cell = limit / CELLS
     radius = reach[np.arange(DIRECTIONS), np.argmax(crossing, axis=1)] + 0.5 * cell
     rear = level.rear.as_array
-    radius, boundary_slope, _ = outline_kernels.newton_to_boundary(
+    radius, boundary_slope, _ = boundary_kernels.newton_to_boundary(
         basis.grid, coefficients, rear, center_mm, way, radius, cell, LAST_MM
     )
     return _boundary_of(level.rear, center_mm, np.degrees(theta), way, radius), boundary_slope
@@ -91,13 +91,13 @@ def retrace_boundary(
     Parameters, return values and errors are the same; ``before`` is the boundary of the similar
     surface. If steps from there do not converge, the boundary is traced from the centre.
     """
-    from labapp.core.surface.kernels import outline_kernels
+    from labapp.core.surface.kernels import boundary_kernels
 
     radius = np.linalg.norm(before.points_mm[:, :2] - before.center_mm, axis=-1)
     theta = np.radians(before.theta_deg)
     way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     longest, rear = np.full(len(radius), LONGEST_MM), level.rear.as_array
-    radius, boundary_slope, over = outline_kernels.newton_to_boundary(
+    radius, boundary_slope, over = boundary_kernels.newton_to_boundary(
         basis.grid, coefficients, rear, center_mm, way, radius, longest, LAST_MM
     )
     boundary = _boundary_of(level.rear, center_mm, before.theta_deg, way, radius)

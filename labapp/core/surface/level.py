@@ -58,7 +58,7 @@ class Level:
         Shift to add to the surface's height, mm.
     sigma_mm
         Its standard uncertainty, mm.
-    sign
+    pool_sign
         +1 for a pool above the work piece inside its boundary, −1 for one below.
     rear
         Part of the boundary below the work piece.
@@ -73,7 +73,7 @@ class Level:
 
     shift_mm: float
     sigma_mm: float
-    sign: int
+    pool_sign: int
     rear: Rear
     negative_log_likelihood: float
     ray_count: int = 0
@@ -118,7 +118,7 @@ class Witnesses(ReadOnlyArrays):
     ----------
     landing_mm
         Landing points on z = 0, shape (m, 3), mm.
-    sign
+    witness
         +1 came back, −1 did not, shape (m,).
     spacing_mm
         Distance between neighbouring landing points along X and along Y, shape (2,), mm.
@@ -132,7 +132,7 @@ class Witnesses(ReadOnlyArrays):
     """
 
     landing_mm: FloatArray
-    sign: IntArray
+    witness: IntArray
     spacing_mm: FloatArray
     head_sign: int
     missing: float = 0.0
@@ -167,10 +167,10 @@ class Witnesses(ReadOnlyArrays):
         return level_kernels.negative_log_evidence(
             there[0],
             there[1:].T,
-            self.sign,
+            self.witness,
             self.spacing_mm,
             level.rear.height(self.landing_mm[:, 1]),
-            level.sign,
+            level.pool_sign,
             self.missing,
             level_kernels.BLURS,
         )
@@ -210,8 +210,8 @@ class LevelSearch:
         level_input = (
             np.empty(0, bool) if outer is None else outer,
             witnesses.landing_mm,
-            witnesses.sign,
-            np.zeros(len(witnesses.sign)) if sigma is None else sigma,
+            witnesses.witness,
+            np.zeros(len(witnesses.witness)) if sigma is None else sigma,
             witnesses.spacing_mm,
         )
         level = near or Level(0.0, np.inf, 1, Rear(), 0.0)

@@ -181,7 +181,7 @@ def fit_pool(
         )
     rounds = Rounds(equations, rays.directions[at], np.zeros(basis.count), points, np.inf)
     witnesses = Witnesses.of(rays, rig.head_sign, match.witness, basis, match.missing)
-    outer = None if (witnesses.sign < 0).any() else _outer(rays.landing_mm[at][:, :2])
+    outer = None if (witnesses.witness < 0).any() else _outer(rays.landing_mm[at][:, :2])
     most, until_mm = settings.rounds, settings.settled_mm
     level = rounds.run(most, until_mm, search=LevelSearch(witnesses, outer=outer))
     if weigh_by_height_sigma and outer is None:
@@ -210,7 +210,7 @@ def normal_equations(
     weights = ray_kernels.slope_weights(
         laser, plane, points_mm, dots, plane_covariance_mm2, settings.floor_mm
     )
-    stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
+    stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness_matrix
     return NormalEquations(basis, stiffness, laser, plane, dots, weights)
 
 

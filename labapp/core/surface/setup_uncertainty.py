@@ -78,7 +78,7 @@ def setup_changes(
         change,
         (landing, match.witness[seen], sigma, own.spacing_mm),
         np.reshape(moved, (-1, *landing.shape)) / SHARE,
-        np.array([rig.head_sign, level.rear.drop_mm, level.sign, REACH, match.missing]),
+        np.array([rig.head_sign, level.rear.drop_mm, level.pool_sign, REACH, match.missing]),
     )
     changes[:, columns] = gradient @ (change + raised[:, None]).T
     return changes

@@ -28,7 +28,7 @@ class Sizes:
 
     Parameters
     ----------
-    size
+    values
         The sizes in this order, shape (6,), mm, mm², mm³.
     peak_mm
         (x, y) where the surface is farthest from the work piece, shape (2,).
@@ -40,7 +40,7 @@ class Sizes:
         Whether the surface is on one side of the boundary's height between centre and boundary.
     """
 
-    size: FloatArray
+    values: FloatArray
     peak_mm: FloatArray
     gradient: FloatArray
     holds: bool
@@ -57,7 +57,7 @@ def sizes_and_gradients(
 
     ``boundary_slope``, shape (m, 2), is returned by `trace_boundary`.
     """
-    from labapp.core.surface.kernels import outline_kernels, spline_kernels
+    from labapp.core.surface.kernels import boundary_kernels, spline_kernels
 
     grid, outline, center = basis.grid, boundary.points_mm, boundary.center_mm
 
@@ -67,7 +67,7 @@ def sizes_and_gradients(
         return np.asarray(z.reshape(np.shape(x_mm)))
 
     count, rear = len(coefficients), level.rear.as_array
-    samples, over, share = outline_kernels.spokes(
+    samples, over, share = boundary_kernels.spokes(
         grid, coefficients, outline, center, FRACTION, WEIGHT, rear, STRIDE
     )
     extremes, changes = [], np.zeros((2, count + 1))
@@ -77,16 +77,16 @@ def sizes_and_gradients(
         if sign * within[2] >= sign * extreme[2]:
             extreme = measures.refined(height, boundary, within, sign)
             change[:-1] = spline_kernels.gradient_of_sum(grid, count, extreme[None, :2], np.ones(1))
-        elif level.sign > 0:
+        elif level.pool_sign > 0:
             change[:] = np.nan
         extremes.append(extreme)
     high, low = extremes
-    by_boundary = outline_kernels.size_gradients(
+    by_boundary = boundary_kernels.size_gradients(
         grid, count, samples, share, outline, boundary_slope, center, rear
     )
     width, length = np.ptp(outline[:, :2], axis=0)
     area, volume = share.sum(), share @ samples[:, 2]
-    above = (level.sign * over > 0).reshape(-1, len(FRACTION))
+    above = (level.pool_sign * over > 0).reshape(-1, len(FRACTION))
     # The middle of a dented pool may lie below the boundary's height, but no part farther out may.
     entered = np.maximum.accumulate(above, axis=1)
     return Sizes(

@@ -143,7 +143,7 @@ class Rounds:
         CannotMeasure
             ``no-surface`` if the slopes do not determine the surface.
         """
-        from labapp.core.surface.kernels import round_kernels
+        from labapp.core.surface.kernels import rounds_kernels
 
         own = self.equations
         smooth = np.zeros_like(self.coefficients) if smooth_about is None else smooth_about
@@ -152,7 +152,7 @@ class Rounds:
         level_input, level, search_limits = search.for_kernel
         limits = np.array([most, until_mm, steps, own.reuse_mm, known[1], *search_limits])
         self.coefficients, self.points_mm, factor, level, (moved, is_new) = (
-            round_kernels.run_rounds(
+            rounds_kernels.run_rounds(
                 own.basis.grid,
                 (own.stiffness, self.rays, own.weights, own.laser_mm, own.plane, own.dots_mm),
                 (self.coefficients, smooth, self.points_mm, known[0]),
@@ -320,12 +320,13 @@ def fit_slopes(
     CannotMeasure
         ``no-surface`` if the slopes do not determine the surface.
     """
-    from labapp.core.surface.kernels import solver_kernels, spline_kernels
+    from labapp.core.surface.kernels import solver_kernels
 
-    splines, (value, *slope) = spline_kernels.splines_at(basis.grid, points_mm)
+    cells = basis.cells(*points_mm.T)
+    splines, (value, *slope) = cells.splines, cells.value_and_slopes()
     weighted = np.einsum("nas,na->ns", weights @ np.stack(slope, axis=1), slopes)
     target = np.bincount(splines.ravel(), weighted.ravel(), basis.count).astype(float)
-    factor = normal_factor(basis, stiffness * basis.roughness, points_mm, weights)
+    factor = normal_factor(basis, stiffness * basis.roughness_matrix, points_mm, weights)
     coefficients = solver_kernels.solve(factor, target[None])[0]
     mean_splines = np.bincount(splines.ravel(), value.ravel(), basis.count) / len(points_mm)
     surface = SplineSurface(basis, coefficients - mean_splines @ coefficients)

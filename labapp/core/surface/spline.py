@@ -90,11 +90,11 @@ def _products(count: int) -> FloatArray:
 
 
 @lru_cache(maxsize=16)
-def _roughness(x_count: int, y_count: int, *step_mm: float) -> FloatArray:
-    """`SplineBasis.roughness`; not kept by the basis, of which a hard frame has hundreds."""
+def _roughness_matrix(x_count: int, y_count: int, *step_mm: float) -> FloatArray:
+    """`SplineBasis.roughness_matrix`; not kept by the basis, of which a hard frame has hundreds."""
     from labapp.core.surface.kernels import solver_kernels
 
-    band = solver_kernels.roughness(_products(x_count), _products(y_count), np.array(step_mm))
+    band = solver_kernels.roughness_band(_products(x_count), _products(y_count), np.array(step_mm))
     band.flags.writeable = False
     return np.asarray(band)
 
@@ -192,12 +192,12 @@ class SplineBasis(ReadOnlyArrays):
         return np.asarray((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high))
 
     @property
-    def roughness(self) -> FloatArray:
+    def roughness_matrix(self) -> FloatArray:
         """Matrix P of ∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² = cᵀPc, read-only.
 
         Lower band, shape (width + 1, splines), in LAPACK's storage.
         """
-        return _roughness(*self.shape, *self.step_mm.tolist())
+        return _roughness_matrix(*self.shape, *self.step_mm.tolist())
 
 
 @dataclass(frozen=True)
@@ -241,5 +241,5 @@ class SplineSurface(ReadOnlyArrays):
 
     def roughness(self) -> float:
         """∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² over the rectangle, mm⁻²."""
-        band, c = self.basis.roughness, self.coefficients
+        band, c = self.basis.roughness_matrix, self.coefficients
         return float(c @ scipy.linalg.blas.dsbmv(len(band) - 1, 1.0, band, c, lower=1))

@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
+from labapp.core.compiled import BOOLS_1, FLOAT, FLOATS_1, FLOATS_2, FLOATS_3, INT, INTS_1
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
-_f, _i = types.float64, types.int64
-_f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
-_i1 = types.Array(_i, 1, "A", readonly=True)
-_levels = types.Tuple((_f, _f, _i))  # type: ignore[no-untyped-call]
+_levels = types.Tuple((FLOAT, FLOAT, INT))  # type: ignore[no-untyped-call]
 
 EPS = 1e-12
 """A factor of 1 plus less than this is replaced by 1: a thousand of them do not change the
@@ -21,14 +19,16 @@ level."""
 FARTHEST = -np.log(EPS)
 """Terms exp(−x) with a larger x are such factors."""
 
-STEPS_A_REACH = 120
-"""Number of grid steps per unit of reach on either side."""
+STEPS_PER_REACH = 120
+"""Grid steps per unit of reach, over both sides together; `negative_log_evidence` uses as many on
+each side."""
 
 NEAR_RISES = 3.0
 """Witnesses whose rays land farther than this from the boundary, in spacings, are ignored."""
 
-FACTORS = 500
-"""Twice so many factors of at most 2 have a product that does not overflow."""
+RAYS_PER_LOG = 500
+"""Rays after which the product is replaced by its logarithm: even twice as many factors of at most
+2 would not overflow."""
 
 SCAN_LEVELS, SCANNED_REACH = 300, 0.6
 """Number of levels that are tried if no estimate is given, and reach of the search around the best
@@ -120,7 +120,7 @@ def _add_witnesses(
         _accumulate(factors[0], lines, start, slope, 1.0)
         if dark[n] and missing > 0.0:
             _accumulate(factors[1], lines, start - np.log(missing), slope, -1.0)
-        if m % FACTORS == FACTORS - 1:
+        if m % RAYS_PER_LOG == RAYS_PER_LOG - 1:
             nats += np.log(factors[0] / factors[1])
             factors[:] = 1.0
 
@@ -137,10 +137,10 @@ def _total(sums: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
     return total
 
 
-@_compiled(_f2, _f1, types.Array(types.boolean, 1, "A", readonly=True), _f1, _f, _levels, _f2)
+@_compiled(FLOATS_2, FLOATS_1, BOOLS_1, FLOATS_1, FLOAT, _levels, FLOATS_2)
 def level_negative_log_likelihood(
     over: FloatArray,
-    side: FloatArray,
+    signed_sharpness: FloatArray,
     dark: BoolArray,
     spread: FloatArray,
     missing: float,
@@ -149,16 +149,17 @@ def level_negative_log_likelihood(
 ) -> FloatArray:
     """−log likelihood of lit and dark witnesses at levels.
 
-    With x = side · (over + level) / √(blur² + spread), a lit ray has P = 1/(1 + exp(−x)), up to a
-    factor common to all levels. A dark ray, whose side has the opposite sign, either lands outside,
-    or lands inside and its dot is missing: P = (1 + m · exp(−x))/(1 + exp(−x)).
+    With x = signed_sharpness · (over + level) / √(blur² + spread), a lit ray has
+    P = 1/(1 + exp(−x)), up to a factor common to all levels. A dark ray, of the opposite sign,
+    either lands outside, or lands inside and its dot is missing:
+    P = (1 + m · exp(−x))/(1 + exp(−x)).
 
     Parameters
     ----------
     over
         Height of the surface over the boundary where n witnesses land, for each of d drops of the
         rear, shape (d, n), mm.
-    side
+    signed_sharpness
         +1 or −1 of each witness, lit or dark, over its rise (`find_level`), shape (n,), mm⁻¹.
     dark
         Which witnesses are dark, shape (n,).
@@ -178,14 +179,14 @@ def level_negative_log_likelihood(
         Nats, shape (d, b, count); infinite for blurs that are negligible at all levels.
     """
     made, count = np.full((len(over), blurs.shape[1], levels[2]), np.inf), levels[2]
-    is_same = np.ones(len(side), np.bool_)
+    is_same = np.ones(len(signed_sharpness), np.bool_)
     for d in range(1, len(over)):
         is_same &= over[d] == over[0]
     # Rays at the head lie as high whatever the drop: their terms are added once.
     same, others = np.flatnonzero(is_same), np.flatnonzero(~is_same)
     least = np.inf
     for b in range(blurs.shape[1] - 1, -1, -1):
-        sharp = side / np.sqrt(blurs[0, b] * blurs[0, b] + spread)
+        sharp = signed_sharpness / np.sqrt(blurs[0, b] * blurs[0, b] + spread)
         common = np.zeros(count), np.ones((2, count)), np.zeros((2, count + 1))
         _add_witnesses(common, same, over[0], sharp, dark, missing, levels)
         if len(over) > 1 and _total(common).min() + blurs[1, b] > least + FARTHEST:
@@ -198,7 +199,7 @@ def level_negative_log_likelihood(
     return made
 
 
-@_compiled(_f3, _f1, _f, _f1, _f, _f)
+@_compiled(FLOATS_3, FLOATS_1, FLOAT, FLOATS_1, FLOAT, FLOAT)
 def level_posterior(
     nats: FloatArray,
     blur_cost: FloatArray,
@@ -273,7 +274,7 @@ def rises_of(slope: FloatArray, spacing: FloatArray) -> tuple[FloatArray, float]
     return np.maximum(rises, usual / 4.0), usual
 
 
-@_compiled(_f2, _f2, _i1, _f1, _i, _f2)
+@_compiled(FLOATS_2, FLOATS_2, INTS_1, FLOATS_1, INT, FLOATS_2)
 def scan_levels(
     height: FloatArray,
     slope: FloatArray,
@@ -288,7 +289,7 @@ def scan_levels(
     """
     rises, _ = rises_of(slope, spacing)
     over, first, exact = height[:1].copy(), -height[0].max(), np.zeros(height.shape[1])
-    least, shift, sign = np.inf, 0.0, 1
+    least, shift, pool_sign = np.inf, 0.0, 1
     levels = first, (height[0].max() - height[0].min()) / (count - 1), count
     for way in (1, -1):
         nats = level_negative_log_likelihood(
@@ -296,8 +297,8 @@ def scan_levels(
         )[0, 0]
         at = np.argmin(nats)
         if nats[at] < least:
-            least, shift, sign = nats[at], first + at * levels[1], way
-    return shift, sign
+            least, shift, pool_sign = nats[at], first + at * levels[1], way
+    return shift, pool_sign
 
 
 @_inner
@@ -310,7 +311,7 @@ def spread_of(sigma: float, rise: float) -> float:
     return np.pi / 8.0 * (sigma / rise) ** 2
 
 
-@_compiled(_f2, _f2, _f1, _i1, _f1, _f1, _f1, _f2)
+@_compiled(FLOATS_2, FLOATS_2, FLOATS_1, INTS_1, FLOATS_1, FLOATS_1, FLOATS_1, FLOATS_2)
 def search_level(
     height: FloatArray,
     slope: FloatArray,
@@ -341,7 +342,7 @@ def search_level(
     found, at_ends
         The level (`find_level`), shape (11,), and its probability at the ends of the grid.
     """
-    head_sign, shift, sign, reach, missing, sunk = search
+    head_sign, shift, pool_sign, reach, missing, sunk = search
     rises, usual = rises_of(slope, spacing)
     low, high = np.inf, -np.inf
     for n in range(len(y)):
@@ -350,36 +351,42 @@ def search_level(
     start = (low + high) / 2.0
     end = min(low, start - 1e-6)  # a single row has no rear
     near = np.flatnonzero(np.abs(height[0] + shift) < NEAR_RISES * rises)
-    side, dark, spread = np.empty(len(near)), np.empty(len(near), np.bool_), np.empty(len(near))
+    signed_sharpness, dark, spread = (
+        np.empty(len(near)),
+        np.empty(len(near), np.bool_),
+        np.empty(len(near)),
+    )
     for m in range(len(near)):
         at = near[m]
-        side[m], dark[m] = sign * witness[at] / rises[at], witness[at] < 0
+        signed_sharpness[m], dark[m] = pool_sign * witness[at] / rises[at], witness[at] < 0
         spread[m] = spread_of(height[1, at], rises[at])
     over = np.empty((len(drops), len(near)))
     for m in range(len(near)):
         share = max((start - head_sign * y[near[m]]) / (start - end), 0.0)
         for d in range(len(drops)):
             over[d, m] = height[0, near[m]] + drops[d] * share * share
-    count = int(np.rint(STEPS_A_REACH * reach)) + 1
+    count = int(np.rint(STEPS_PER_REACH * reach)) + 1
     first, step = shift - reach * usual, 2.0 * reach * usual / (count - 1)
     levels = first, step, count
-    nats = level_negative_log_likelihood(over, side, dark, spread, missing, levels, blurs)
+    nats = level_negative_log_likelihood(
+        over, signed_sharpness, dark, spread, missing, levels, blurs
+    )
     mean, sigma, drop, drop_sigma, covariance, at_ends = level_posterior(
         nats, blurs[1], sunk, drops, first, step
     )
-    level, rear = (mean, sigma, sign), (drop, head_sign * start, head_sign * end)
+    level, rear = (mean, sigma, pool_sign), (drop, head_sign * start, head_sign * end)
     seen = nats.min(), float(len(near)), usual
     return np.array([*level, *rear, *seen, drop_sigma, covariance]), at_ends
 
 
-@_compiled(_f2, _f2, _f1, _i1, _f1, _f1, _f1, _f)
+@_compiled(FLOATS_2, FLOATS_2, FLOATS_1, INTS_1, FLOATS_1, FLOATS_1, FLOATS_1, FLOAT)
 def find_level(
     height: FloatArray,
     slope: FloatArray,
     y: FloatArray,
     witness: IntArray,
     spacing: FloatArray,
-    rear: FloatArray,
+    head_and_drop: FloatArray,
     about: FloatArray,
     missing: float,
 ) -> FloatArray:
@@ -401,7 +408,7 @@ def find_level(
         +1 lit, −1 dark, shape (m,).
     spacing
         Distance between neighbouring landing points along X and along Y, shape (2,), mm.
-    rear
+    head_and_drop
         +1 where the head lies towards +Y and the rear towards −Y, −1 for the reverse
         (`Rig.head_sign`); and the depth of the rear, mm, or NaN to find it along with the level.
     about
@@ -418,17 +425,17 @@ def find_level(
         least −log likelihood, number of rays, and usual rise, mm; standard uncertainty of the drop,
         mm, and its covariance with the shift, mm² (`level.Level`), shape (11,).
     """
-    (head_sign, drop), (shift, sign, reach) = rear, about
+    (head_sign, drop), (shift, pool_sign, reach) = head_and_drop, about
     is_tried = False
     while True:
         if np.isnan(reach):
-            scanned, side = scan_levels(height, slope, witness, spacing, SCAN_LEVELS, BLURS[:, -1:])
-            shift, sign, reach, is_tried = scanned, float(side), SCANNED_REACH, True
+            scanned, way = scan_levels(height, slope, witness, spacing, SCAN_LEVELS, BLURS[:, -1:])
+            shift, pool_sign, reach, is_tried = scanned, float(way), SCANNED_REACH, True
         # Only pools above the work piece have been observed to sink at the rear.
         drops = np.array([0.0 if np.isnan(drop) else drop])
-        if np.isnan(drop) and sign > 0.0:
+        if np.isnan(drop) and pool_sign > 0.0:
             drops = DROPS_MM.copy()
-        search = np.array([head_sign, shift, sign, reach, missing, SUNK_COST])
+        search = np.array([head_sign, shift, pool_sign, reach, missing, SUNK_COST])
         found, at_ends = search_level(height, slope, y, witness, spacing, search, drops, BLURS)
         is_wide = reach >= 1.0
         if (is_tried and is_wide) or not at_ends > (MOST_AT_FAR_ENDS if is_wide else MOST_AT_ENDS):
@@ -436,34 +443,36 @@ def find_level(
         reach = np.nan if is_wide else 1.0
 
 
-@_compiled(_f1, _f2, _i1, _f1, _f1, _f, _f, _f2)
+@_compiled(FLOATS_1, FLOATS_2, INTS_1, FLOATS_1, FLOATS_1, FLOAT, FLOAT, FLOATS_2)
 def negative_log_evidence(
     height: FloatArray,
     slope: FloatArray,
     witness: IntArray,
     spacing: FloatArray,
-    rear: FloatArray,
-    sign: float,
+    boundary_height: FloatArray,
+    pool_sign: float,
     missing: float,
     blurs: FloatArray,
 ) -> float:
     """−log probability of the witnesses, marginalised over levels near 0 and blurs, nats.
 
-    ``rear`` is the height of the boundary at the m landing points, shape (m,), mm. ``blurs`` is
+    ``boundary_height`` is that at the m landing points, shape (m,), mm. ``blurs`` is
     that of `search_level`, ``height`` is taken as exact, shape (m,), mm, and the others are those
     of `find_level`. A constant is omitted.
     """
     rises, usual = rises_of(slope, spacing)
     near = np.flatnonzero(np.abs(height) < NEAR_RISES * rises)
-    over, side = np.empty((1, len(near))), np.empty(len(near))
+    over, signed_sharpness = np.empty((1, len(near))), np.empty(len(near))
     dark = np.empty(len(near), np.bool_)
     for m in range(len(near)):
         at = near[m]
-        over[0, m] = height[at] - rear[at]
-        side[m], dark[m] = sign * witness[at] / rises[at], witness[at] < 0
+        over[0, m] = height[at] - boundary_height[at]
+        signed_sharpness[m], dark[m] = pool_sign * witness[at] / rises[at], witness[at] < 0
     exact = np.zeros(len(near))
-    levels = -usual, usual / STEPS_A_REACH, 2 * STEPS_A_REACH + 1
-    nats = level_negative_log_likelihood(over, side, dark, exact, missing, levels, blurs)
+    levels = -usual, usual / STEPS_PER_REACH, 2 * STEPS_PER_REACH + 1
+    nats = level_negative_log_likelihood(
+        over, signed_sharpness, dark, exact, missing, levels, blurs
+    )
     least, total = np.inf, 0.0
     for b in range(blurs.shape[1]):
         least = min(least, nats[0, b].min() + blurs[1, b])
@@ -472,7 +481,7 @@ def negative_log_evidence(
     return float(least - np.log(total))
 
 
-@_compiled(_f1, types.Array(types.boolean, 1, "A", readonly=True))
+@_compiled(FLOATS_1, BOOLS_1)
 def guess_level(height: FloatArray, outer: BoolArray) -> tuple[float, float, float]:
     """Shift that sets the mean of outer points to 0, std of all heights, mean of inner heights.
 

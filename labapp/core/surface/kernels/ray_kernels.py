@@ -1,28 +1,17 @@
-"""Rays that meet the surface and fall on the imaging plane, compiled (docs/adr/0018).
+"""Rays that meet the surface and fall on the imaging plane, compiled.
 
-Arguments mean the same in all of these modules, all in the UCS and mm:
-
-* ``grid``: low end, high end, step and number of cells of the splines along x and along y, shape
-  (2, 4) (`SplineBasis.grid`); with it ``coefficients`` of the splines, shape (p,).
-* ``rays``: unit directions from the laser, shape (n, 3); ``points``: where they meet the surface.
-* ``plane``: O′, the directions of O′X′ and O′Z′ and the normal of the imaging plane, and thickness
-  and index of its glass, shape (5, 3) (`ImagingPlane.pose_mm`).
-* ``work``: memory to write on, which holds values and slopes of the four splines along x, then
-  those along y, shape (4, 4).
+Arguments have the meanings that the package gives.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import types
 
+from labapp.core.compiled import FLOAT, FLOATS_1, FLOATS_2, FLOATS_3, INT
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
 from labapp.core.surface.kernels.spline_kernels import height_and_slopes
 from labapp.core.values import BoolArray, FloatArray
-
-_f, _i = types.float64, types.int64
-_f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 4))
 
 LONGEST_STEP_MM, LEAST_DESCENT = 0.5, 0.05
 """Longest Newton step along a ray, mm, and the least descent towards the surface that is assumed
@@ -57,7 +46,10 @@ def newton_step(
 
 @_inner
 def _in_glass(index: float, tangent2: float) -> float:
-    """Tangent of a ray's angle to the normal in glass, over that in air; of which the square."""
+    """Ratio of the tangents of a ray's angles in glass and in air.
+
+    ``tangent2`` is the square of that in air.
+    """
     return float(1.0 / np.sqrt(index * index + (index * index - 1.0) * tangent2))
 
 
@@ -67,7 +59,7 @@ def _through_glass(
 ) -> tuple[float, float]:
     """Dot of a ray in a direction that would meet the plane at (x, z) without its glass.
 
-    ``along`` is what the direction has along the normal.
+    ``along`` is the direction's component along the normal.
     """
     aside, up = 0.0, 0.0
     for axis in range(3):
@@ -81,7 +73,7 @@ def _through_glass(
 def reflected_dot(
     ray: FloatArray, point: FloatArray, slope_x: float, slope_y: float, plane: FloatArray
 ) -> tuple[float, float]:
-    """Dot (X′, Z′) of a ray reflected at a point where a surface has some slopes; NaN if none."""
+    """Dot (X′, Z′) of a ray reflected at a point of given slopes; NaN if there is none."""
     # Twice the ray's part along the normal (−f_x, −f_y, 1) is taken off (Eq. 4-4).
     twice = 2.0 * (ray[2] - slope_x * ray[0] - slope_y * ray[1])
     twice /= slope_x * slope_x + slope_y * slope_y + 1.0
@@ -128,7 +120,7 @@ def without_glass(
     return dot[0] + farther * x, dot[1] + farther * y, dot[2] + farther * z
 
 
-@_compiled(_f2, _f1, _f2, _f2, _i, _f2)
+@_compiled(FLOATS_2, FLOATS_1, FLOATS_2, FLOATS_2, INT, FLOATS_2)
 def intersect_and_reflect(
     grid: FloatArray,
     coefficients: FloatArray,
@@ -142,7 +134,7 @@ def intersect_and_reflect(
     Parameters
     ----------
     grid, coefficients, rays, plane
-        See the module.
+        See the package.
     points
         Where Newton's method begins, shape (n, 3).
     steps
@@ -205,7 +197,7 @@ def slope_jacobian(
     )
 
 
-@_compiled(_f1, _f2, _f2, _f2, _f3, _f)
+@_compiled(FLOATS_1, FLOATS_2, FLOATS_2, FLOATS_2, FLOATS_3, FLOAT)
 def slope_weights(
     laser: FloatArray,
     plane: FloatArray,
@@ -233,13 +225,13 @@ def slope_weights(
     return out
 
 
-@_compiled(_f2, _f2, _f2, _f)
+@_compiled(FLOATS_2, FLOATS_2, FLOATS_2, FLOAT)
 def behind_torch(points: FloatArray, rays: FloatArray, slopes: FloatArray, tip: float) -> BoolArray:
     """Whether the torch may hide the dots of rays (§4.2.1): they pass above its tip, or nearly.
 
     The incident ray does so for points behind the electrode (y < 0), the reflected one for points
-    before it. A mask, shape (n,); slopes of the surface at the points have shape (n, 2), ``tip`` is
-    the height of the electrode's tip, mm.
+    in front of it. A mask, shape (n,); slopes of the surface at the points have shape (n, 2),
+    ``tip`` is the height of the electrode's tip, mm.
     """
     hidden = np.empty(len(rays), np.bool_)
     for k in range(len(rays)):

@@ -1,6 +1,6 @@
-"""Response of a fitted surface and of its level to a perturbed bench, compiled (docs/adr/0018).
+"""Response of a fitted surface and of its level to a perturbed bench, compiled.
 
-Arguments mean the same as in `solver_kernels`.
+Arguments have the meanings that the package gives.
 """
 
 from __future__ import annotations
@@ -8,22 +8,23 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
+from labapp.core.compiled import BAND, FLOATS_1, FLOATS_2, FLOATS_3, INT, INTS_1
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.surface.kernels.level_kernels import find_level
 from labapp.core.surface.kernels.solver_kernels import gradient_rhs, newton_along_rays, solve
 from labapp.core.surface.kernels.spline_kernels import surface_at
 from labapp.core.values import FloatArray, IntArray
 
-_f, _i = types.float64, types.int64
-_f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
-_lower = types.Array(_f, 2, "F", readonly=True)
-_own = types.Tuple((_f1, _f2, _f2))  # type: ignore[no-untyped-call]
-_moved = types.Tuple((_f2, _f3, _f3, _f3))  # type: ignore[no-untyped-call]
-_i1 = types.Array(_i, 1, "A", readonly=True)
-_witnesses = types.Tuple((_f2, _i1, _f1, _f1))  # type: ignore[no-untyped-call]
+_own = types.Tuple((FLOATS_1, FLOATS_2, FLOATS_2))  # type: ignore[no-untyped-call]
+_moved = types.Tuple((FLOATS_2, FLOATS_3, FLOATS_3, FLOATS_3))  # type: ignore[no-untyped-call]
+_witnesses = types.Tuple((FLOATS_2, INTS_1, FLOATS_1, FLOATS_1))  # type: ignore[no-untyped-call]
+
+NEWTON_STEPS = 2
+"""Newton steps from where the rays of a slightly perturbed bench pass at the height of the
+unperturbed reflection points, which is very close to the surface."""
 
 
-@_compiled(_f2, _f1, _lower, _f2, _f3, _own, _moved, _i)
+@_compiled(FLOATS_2, FLOATS_1, BAND, FLOATS_2, FLOATS_3, _own, _moved, INT)
 def coefficient_changes(
     grid: FloatArray,
     coefficients: FloatArray,
@@ -59,7 +60,7 @@ def coefficient_changes(
         for n in range(len(points)):
             along = (points[n, 2] - lasers[k, 2]) / rays[k, n, 2]
             start[n] = lasers[k] + along * rays[k, n]
-        there, _ = newton_along_rays(grid, coefficients, rays[k], start, 2)
+        there, _ = newton_along_rays(grid, coefficients, rays[k], start, NEWTON_STEPS)
         _, slope_x, slope_y = surface_at(grid, coefficients, there)
         for n in range(len(points)):
             x, y, z = rays[k, n]
@@ -75,7 +76,7 @@ def coefficient_changes(
     return changes
 
 
-@_compiled(_f2, _f1, _f2, _witnesses, _f3, _f1)
+@_compiled(FLOATS_2, FLOATS_1, FLOATS_2, _witnesses, FLOATS_3, FLOATS_1)
 def level_changes(
     grid: FloatArray,
     coefficients: FloatArray,
@@ -96,18 +97,18 @@ def level_changes(
     changes
         Changes of its coefficients (`coefficient_changes`), shape (q, p), mm.
     witnesses
-        Landing points, shape (m, 3), signs, shape (m,), and uncertainty of the height there, shape
-        (m,), of the witnesses, and the spacing of the rays, shape (2,) (`level.Witnesses`).
+        Landing points, shape (m, 3), +1 or −1, shape (m,), and uncertainty of the height there,
+        shape (m,), of the witnesses, and the spacing of the rays, shape (2,) (`level.Witnesses`).
     aside
         Displacements of the landing points on each bench, shape (q, m, 3), mm.
     search
         Side of the head, drop of the rear, sign of the pool, reach of the search in rises, and
         share of missing dots.
     """
-    landing, sign, sigma, spacing = witnesses
-    head_sign, drop, side, reach, missing = search
-    rear, about = np.array([head_sign, drop]), np.array([0.0, side, reach])
-    height, levels = np.empty((2, len(sign))), np.empty(len(changes))
+    landing, witness, sigma, spacing = witnesses
+    head_sign, drop, pool_sign, reach, missing = search
+    head_and_drop, about = np.array([head_sign, drop]), np.array([0.0, pool_sign, reach])
+    height, levels = np.empty((2, len(witness))), np.empty(len(changes))
     height[1] = sigma
     for k in range(len(changes)):
         shifts = np.empty(2)
@@ -116,9 +117,8 @@ def level_changes(
             places = landing + way * aside[k]
             there = surface_at(grid, coefficients + way * changes[k], places)
             height[0] = there[0]
-            found = find_level(
-                height, there[1:].T, places[:, 1], sign, spacing, rear, about, missing
-            )
+            seen = height, there[1:].T, places[:, 1], witness, spacing
+            found = find_level(*seen, head_and_drop, about, missing)
             shifts[n] = found[0]
         levels[k] = (shifts[0] - shifts[1]) / 2.0
     return levels

@@ -1,8 +1,6 @@
-"""Samples for the shape parameters of a pool, and their derivatives, compiled (docs/adr/0018).
+"""Samples for the shape parameters of a pool, and their derivatives, compiled.
 
-``grid`` and ``coefficients`` mean the same as in `outline_kernels`. The outline is the m boundary
-points, shape (m, 3), mm, and ``boundary_slope`` the gradient of the surface's height over that of
-the boundary there, shape (m, 2).
+Arguments have the meanings that the package gives.
 """
 
 from __future__ import annotations
@@ -10,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
+from labapp.core.compiled import FLOATS_1, FLOATS_2, FLOATS_3
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
 from labapp.core.surface.kernels.spline_kernels import (
@@ -19,10 +18,8 @@ from labapp.core.surface.kernels.spline_kernels import (
 )
 from labapp.core.values import FloatArray, IntArray
 
-_f = types.float64
-_f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
-_spokes = types.Tuple((_f1, _f1, _f3, _f2))  # type: ignore[no-untyped-call]
-_rims = types.Tuple((_f1, _f2, _f2, _f1))  # type: ignore[no-untyped-call]
+_spokes = types.Tuple((FLOATS_1, FLOATS_1, FLOATS_3, FLOATS_2))  # type: ignore[no-untyped-call]
+_rims = types.Tuple((FLOATS_1, FLOATS_2, FLOATS_2, FLOATS_1))  # type: ignore[no-untyped-call]
 
 SPOKES, RINGS = 48, 8
 """Directions from the middle of the boundary, the first along −Y, a multiple of 4; and samples
@@ -30,7 +27,8 @@ along each."""
 
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(RINGS)
 FRACTION, HALVED_WEIGHT = (_NODE + 1) / 2, _WEIGHT / 2
-"""Fractions of the way outwards at which the surface is sampled, and their weights."""
+"""Fractions of the way outwards at which the surface is sampled, and their Gauss–Legendre weights,
+halved for the interval 0 … 1."""
 
 PHI = -np.pi / 2 + 2 * np.pi * np.arange(SPOKES) / SPOKES
 WAY = np.column_stack([np.cos(PHI), np.sin(PHI)])
@@ -72,7 +70,7 @@ def _around(angle: FloatArray, order: IntArray, values: FloatArray, phi: float) 
     return float(values[before] + share * (values[after] - values[before]))
 
 
-@_compiled(_f2, _f1)
+@_compiled(FLOATS_2, FLOATS_1)
 def sample_places(
     outline: FloatArray, center: FloatArray
 ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
@@ -228,7 +226,7 @@ def _wetting(
     return 0.0
 
 
-@_compiled(_f2, _f1, _f2, _f2, _f1, _spokes, _rims, _f1)
+@_compiled(FLOATS_2, FLOATS_1, FLOATS_2, FLOATS_2, FLOATS_1, _spokes, _rims, FLOATS_1)
 def shape_gradients(
     grid: FloatArray,
     coefficients: FloatArray,
@@ -237,7 +235,7 @@ def shape_gradients(
     rear: FloatArray,
     spokes: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     rim: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    shape: FloatArray,
+    shape_parameters: FloatArray,
 ) -> FloatArray:
     """Derivatives of the shape parameters by the p spline coefficients and the drop of the rear.
 
@@ -245,23 +243,21 @@ def shape_gradients(
 
     Parameters
     ----------
-    grid, coefficients, outline, boundary_slope
-        See the module.
-    rear
-        `Rear.as_array`.
+    grid, coefficients, outline, boundary_slope, rear
+        See the package.
     spokes, rim
         Results of `sample_places`, with the heights of the surface on the spokes, shape (s, r), and
         its slopes inwards at the rim, shape (m,).
-    shape
-        The parameters, shape (3,).
+    shape_parameters
+        Their values, shape (3,).
     """
     out = np.zeros((3, len(coefficients) + 1))
     low, high = np.argmin(outline[:, 0]), np.argmax(outline[:, 0])
     edge = outline, boundary_slope, rear
     by_middle = (
-        _convexity(grid, coefficients, *edge, spokes, shape[0], out[0]),
-        _asymmetry(grid, *edge, spokes, rim, shape[1], out[1]),
-        _wetting(grid, coefficients, *edge, rim, shape[2], out[2]),
+        _convexity(grid, coefficients, *edge, spokes, shape_parameters[0], out[0]),
+        _asymmetry(grid, *edge, spokes, rim, shape_parameters[1], out[1]),
+        _wetting(grid, coefficients, *edge, rim, shape_parameters[2], out[2]),
     )
     work = np.empty((4, 4))
     for parameter in range(3):

@@ -1,17 +1,6 @@
-"""The steps of the fit and its covariance, compiled (docs/adr/0018).
+"""The steps of the fit and its covariance, compiled.
 
-Arguments mean the same in all of these modules, all in the UCS and mm:
-
-* ``grid``: low end, high end, step and number of cells of the splines along x and along y, shape
-  (2, 4) (`SplineBasis.grid`); with it ``coefficients`` of the splines, shape (p,).
-* ``rays``: unit directions from the laser, shape (n, 3); ``points``: where they meet the surface.
-* ``plane``: O′, the directions of O′X′ and O′Z′ and the normal of the imaging plane, and thickness
-  and index of its glass, shape (5, 3) (`ImagingPlane.pose_mm`).
-* ``work``: memory to write on, which holds values and slopes of the four splines along x, then
-  those along y, shape (4, 4).
-
-A lower band has the shape (width + 1, p), as LAPACK has it, and its columns follow on each other in
-memory; ``columns`` is the same transposed.
+Arguments have the meanings that the package gives.
 """
 
 from __future__ import annotations
@@ -19,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
+from labapp.core.compiled import BAND, FLOATS_1, FLOATS_2, FLOATS_3, INT
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
 from labapp.core.surface.kernels.ray_kernels import (
@@ -30,10 +20,7 @@ from labapp.core.surface.kernels.ray_kernels import (
 from labapp.core.surface.kernels.spline_kernels import cubic_splines, height_and_slopes, surface_at
 from labapp.core.values import FloatArray
 
-_f, _i = types.float64, types.int64
-_f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 4))
-_lower = types.Array(_f, 2, "F", readonly=True)
-_bands, _bench = types.UniTuple(_lower, 2), types.Tuple((_f1, _f2))  # type: ignore[no-untyped-call]
+_bands, _bench = types.UniTuple(BAND, 2), types.Tuple((FLOATS_1, FLOATS_2))  # type: ignore[no-untyped-call]
 
 ON_SURFACE_MM = 1e-9
 """Newton's method stops after a shorter step: the next would be far below rounding."""
@@ -42,9 +29,9 @@ AT_ONCE = 8
 """Columns of a matrix that are factorized at once."""
 
 
-@_compiled(_f3, _f3, _f1)
-def roughness(along_x: FloatArray, along_y: FloatArray, step: FloatArray) -> FloatArray:
-    """Band of `SplineBasis.roughness` from the products along x and along y in cells of size 1.
+@_compiled(FLOATS_3, FLOATS_3, FLOATS_1)
+def roughness_band(along_x: FloatArray, along_y: FloatArray, step: FloatArray) -> FloatArray:
+    """Band of `SplineBasis.roughness_matrix` from products along x and along y in cells of size 1.
 
     Those of each spline with itself and the next three, for orders 0 … 3, shapes (4, nx, 4) and
     (4, ny, 4) (`spline._products`); the size of a cell has shape (2,), mm.
@@ -71,8 +58,8 @@ def roughness(along_x: FloatArray, along_y: FloatArray, step: FloatArray) -> Flo
 def _accumulate_normal_matrix(
     grid: FloatArray, points: FloatArray, weights: FloatArray, columns: FloatArray
 ) -> None:
-    """Add what slopes at points weigh to the columns of a normal matrix's lower band."""
-    work, many = np.empty((4, 4)), int(grid[1, 3]) + 3
+    """Add the contribution of slopes at points to the columns of a normal matrix's lower band."""
+    work, y_count = np.empty((4, 4)), int(grid[1, 3]) + 3
     by_x, by_y = np.empty(16), np.empty(16)
     for k in range(len(points)):
         first_x = cubic_splines(grid[0], points[k, 0], work[0], work[1])
@@ -85,9 +72,9 @@ def _accumulate_normal_matrix(
         for own in range(16):
             along_x = xx * by_x[own] + xy * by_y[own]
             along_y = xy * by_x[own] + yy * by_y[own]
-            column = columns[(first_x + own // 4) * many + first_y + own % 4]
+            column = columns[(first_x + own // 4) * y_count + first_y + own % 4]
             for other in range(own, 16):
-                below = (other // 4 - own // 4) * many + other % 4 - own % 4
+                below = (other // 4 - own // 4) * y_count + other % 4 - own % 4
                 column[below] += along_x * by_x[other] + along_y * by_y[other]
 
 
@@ -126,7 +113,7 @@ def _factorize(columns: FloatArray, count: int, width: int) -> bool:
     return True
 
 
-@_compiled(_f2, _lower, _f2, _f3)
+@_compiled(FLOATS_2, BAND, FLOATS_2, FLOATS_3)
 def normal_factor(
     grid: FloatArray, stiffness: FloatArray, points: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, bool]:
@@ -173,7 +160,7 @@ def _solve(columns: FloatArray, right: FloatArray) -> None:
         rest[0] = (rest[0] - total) / column[0]
 
 
-@_compiled(_lower, _f2)
+@_compiled(BAND, FLOATS_2)
 def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
     """Solve the normal equations of a factor for m right-hand sides, shape (m, p)."""
     made = right.copy()
@@ -182,7 +169,7 @@ def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
     return made
 
 
-@_compiled(_lower)
+@_compiled(BAND)
 def inverse_band(lower: FloatArray) -> FloatArray:
     """Band of the inverse of LLᵀ, both triangles, shape (p, p).
 
@@ -214,7 +201,7 @@ def inverse_band(lower: FloatArray) -> FloatArray:
     return inverse
 
 
-@_compiled(_f2, _f2, _f1, _f2)
+@_compiled(FLOATS_2, FLOATS_2, FLOATS_1, FLOATS_2)
 def height_variances(
     grid: FloatArray, inverse: FloatArray, of_mean: FloatArray, points: FloatArray
 ) -> FloatArray:
@@ -232,23 +219,23 @@ def height_variances(
     points
         Shape (m, ≥ 2), mm.
     """
-    out, work, many = np.empty(len(points)), np.empty((4, 4)), int(grid[1, 3]) + 3
+    out, work, y_count = np.empty(len(points)), np.empty((4, 4)), int(grid[1, 3]) + 3
     for k in range(len(points)):
-        first = cubic_splines(grid[0], points[k, 0], work[0], work[1]) * many
+        first = cubic_splines(grid[0], points[k, 0], work[0], work[1]) * y_count
         first += cubic_splines(grid[1], points[k, 1], work[2], work[3])
         variance = of_mean[-1]
         for a in range(4):
             for b in range(4):
-                spline, along = first + a * many + b, 0.0
+                spline, along = first + a * y_count + b, 0.0
                 for c in range(4):
                     for d in range(4):
-                        along += work[0, c] * work[2, d] * inverse[spline, first + c * many + d]
+                        along += work[0, c] * work[2, d] * inverse[spline, first + c * y_count + d]
                 variance += work[0, a] * work[2, b] * (along - 2.0 * of_mean[spline])
         out[k] = max(variance, 0.0)
     return out
 
 
-@_compiled(_f2, _f2, _f1, _f2, _f2, _f2)
+@_compiled(FLOATS_2, FLOATS_2, FLOATS_1, FLOATS_2, FLOATS_2, FLOATS_2)
 def covariance_of_dots(
     grid: FloatArray,
     inverse: FloatArray,
@@ -262,11 +249,11 @@ def covariance_of_dots(
     ``inverse`` is the covariance of the p coefficients (`inverse_band`), whose band contains all
     splines of a cell. Points and dots are in the UCS, shape (n, 3), mm.
     """
-    pairs, work, many = len(points), np.empty((4, 4)), int(grid[1, 3]) + 3
+    pairs, work, y_count = len(points), np.empty((4, 4)), int(grid[1, 3]) + 3
     first = np.empty(pairs, np.int64)
     for k in range(pairs):
         first_x = cubic_splines(grid[0], points[k, 0], work[0], work[1])
-        first[k] = first_x * many + cubic_splines(grid[1], points[k, 1], work[2], work[3])
+        first[k] = first_x * y_count + cubic_splines(grid[1], points[k, 1], work[2], work[3])
     out = np.zeros((pairs, 2, 2))
     by_u, by_v = np.empty(16), np.empty(16)
     for k in range(pairs):
@@ -280,11 +267,11 @@ def covariance_of_dots(
             by_u[own] = (yv * by_x - xv * by_y) / area
             by_v[own] = (xu * by_y - yu * by_x) / area
         for own in range(16):
-            row = inverse[first[k] + own // 4 * many + own % 4, first[k] :]
+            row = inverse[first[k] + own // 4 * y_count + own % 4, first[k] :]
             along_u, along_v = 0.0, 0.0
             for a in range(4):
                 for b in range(4):
-                    entry = row[a * many + b]
+                    entry = row[a * y_count + b]
                     along_u += entry * by_u[4 * a + b]
                     along_v += entry * by_v[4 * a + b]
             out[k, 0, 0] += by_u[own] * along_u
@@ -294,7 +281,7 @@ def covariance_of_dots(
     return out
 
 
-@_compiled(_lower, _f2)
+@_compiled(BAND, FLOATS_2)
 def variances(lower: FloatArray, gradients: FloatArray) -> FloatArray:
     """Diagonal of G (LLᵀ)⁻¹ Gᵀ, shape (m,).
 
@@ -307,7 +294,7 @@ def variances(lower: FloatArray, gradients: FloatArray) -> FloatArray:
     return out
 
 
-@_compiled(_f2, _f1, _f2, _f3, _f1, _f2, _f2)
+@_compiled(FLOATS_2, FLOATS_1, FLOATS_2, FLOATS_3, FLOATS_1, FLOATS_2, FLOATS_2)
 def gradient_rhs(
     grid: FloatArray,
     coefficients: FloatArray,
@@ -317,13 +304,13 @@ def gradient_rhs(
     plane: FloatArray,
     dots: FloatArray,
 ) -> FloatArray:
-    """Right-hand side of the normal equations, shape (p,): Σ Jᵀ W (slopes asked for − slopes).
+    """Right-hand side of the normal equations, shape (p,): Σ Jᵀ W (slopes required − slopes).
 
-    Asked for at each point are the slopes that turn its ray to its dot, shape (n, 3), UCS; weights
+    Required at each point are the slopes that turn its ray to its dot, shape (n, 3), UCS; weights
     are the inverse covariances of these slopes, shape (n, 2, 2).
     """
     out, work = np.zeros(len(coefficients)), np.empty((4, 4))
-    many, glass = int(grid[1, 3]) + 3, plane[4, 0] != 0.0
+    y_count, glass = int(grid[1, 3]) + 3, plane[4, 0] != 0.0
     for k in range(len(points)):
         x, y = points[k, 0], points[k, 1]
         _, slope_x, slope_y = height_and_slopes(grid, coefficients, x, y, work)
@@ -339,22 +326,22 @@ def gradient_rhs(
         for a in range(4):
             for b in range(4):
                 by_x, by_y = work[1, a] * work[2, b], work[0, a] * work[3, b]
-                out[(first_x + a) * many + first_y + b] += pull_x * by_x + pull_y * by_y
+                out[(first_x + a) * y_count + first_y + b] += pull_x * by_x + pull_y * by_y
     return out
 
 
-@_compiled(_f2, _bands, _f1, _f1, _f2, _f3, _bench, _f2)
+@_compiled(FLOATS_2, _bands, FLOATS_1, FLOATS_1, FLOATS_2, FLOATS_3, _bench, FLOATS_2)
 def fit_step(
     grid: FloatArray,
     bands: tuple[FloatArray, FloatArray],
     coefficients: FloatArray,
-    rough: FloatArray,
+    from_smooth: FloatArray,
     points: FloatArray,
     weights: FloatArray,
     bench: tuple[FloatArray, FloatArray],
     dots: FloatArray,
 ) -> FloatArray:
-    """Coefficients after one step of the fit (`NormalEquations.step`), shape (p,).
+    """Coefficients after one step of the fit (`Rounds.run`), shape (p,).
 
     Parameters
     ----------
@@ -362,8 +349,8 @@ def fit_step(
         See `gradient_rhs`.
     bands
         Stiffness and factor, see `normal_factor`.
-    rough
-        Coefficients of the surface that is held smooth, shape (p,).
+    from_smooth
+        Coefficients minus those of the surface from which the roughness is counted, shape (p,).
     bench
         The laser and the plane.
     """
@@ -371,11 +358,11 @@ def fit_step(
     change = gradient_rhs(grid, coefficients, points, weights, laser, plane, dots)
     columns, (height, count) = stiffness.T, stiffness.shape
     for j in range(count):
-        column, own, rest, total = columns[j], rough[j], change[j:], 0.0
+        column, own, rest, total = columns[j], from_smooth[j], change[j:], 0.0
         rest[0] -= column[0] * own
         for k in range(1, min(height, count - j)):
             rest[k] -= column[k] * own
-            total += column[k] * rough[j + k]
+            total += column[k] * from_smooth[j + k]
         rest[0] -= total
     _solve(factor.T, change)
     # Slopes leave the level open: the mean height of the points stays.
@@ -385,13 +372,14 @@ def fit_step(
     return coefficients + (change - mean)
 
 
-@_compiled(_f2, _f1, _f2, _f2, _i)
+@_compiled(FLOATS_2, FLOATS_1, FLOATS_2, FLOATS_2, INT)
 def newton_along_rays(
     grid: FloatArray, coefficients: FloatArray, rays: FloatArray, points: FloatArray, steps: int
 ) -> tuple[FloatArray, float]:
-    """Points moved along their rays to a surface by so many Newton steps, shape (n, 3), mm.
+    """Move points along their rays to a surface by ``steps`` Newton steps.
 
-    The second value is how far the farthest moved along X, Y or Z, mm; NaN where one is.
+    Returns the points, shape (n, 3), and the largest displacement along X, Y or Z, mm; NaN if any
+    is NaN.
     """
     moved, most, work = points.copy(), 0.0, np.empty((4, 4))
     for k in range(len(points)):

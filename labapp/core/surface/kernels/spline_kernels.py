@@ -1,24 +1,16 @@
-"""Splines and the surface that they make, compiled for the processor (docs/adr/0018).
+"""Splines and the surface that they make, compiled.
 
-Arguments mean the same in all of these modules, all in the UCS and mm:
-
-* ``grid``: low end, high end, step and number of cells of the splines along x and along y, shape
-  (2, 4) (`SplineBasis.grid`); with it ``coefficients`` of the splines, shape (p,).
-* ``work``: memory to write on, which holds values and slopes of the four splines along x, then
-  those along y, shape (4, 4).
+Arguments have the meanings that the package gives.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import types
 
+from labapp.core.compiled import FLOATS_1, FLOATS_2, INT
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
-from labapp.core.values import FloatArray, IntArray
-
-_f, _i = types.float64, types.int64
-_f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 4))
+from labapp.core.values import FloatArray
 
 
 @_inner
@@ -50,10 +42,10 @@ def height_and_slopes(
     """Height and slopes of a surface; values and slopes of the splines there stay in ``work``."""
     first_x = cubic_splines(grid[0], x, work[0], work[1])
     first_y = cubic_splines(grid[1], y, work[2], work[3])
-    many = int(grid[1, 3]) + 3
+    y_count = int(grid[1, 3]) + 3
     z, slope_x, slope_y = 0.0, 0.0, 0.0
     for a in range(4):
-        at = (first_x + a) * many + first_y
+        at = (first_x + a) * y_count + first_y
         value, slope = 0.0, 0.0
         for b in range(4):
             value += work[2, b] * coefficients[at + b]
@@ -64,28 +56,7 @@ def height_and_slopes(
     return z, slope_x, slope_y
 
 
-@_compiled(_f2, _f2)
-def splines_at(grid: FloatArray, place: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Splines that are not zero at places, shape (n, 2), held to the rectangle.
-
-    Returns their numbers, shape (n, 16); value and derivatives by x and by y, shape (3, n, 16).
-    """
-    count, many = len(place), int(grid[1, 3]) + 3
-    splines, values = np.empty((count, 16), np.int64), np.empty((3, count, 16))
-    work = np.empty((4, 4))
-    for k in range(count):
-        first_x = cubic_splines(grid[0], place[k, 0], work[0], work[1])
-        first_y = cubic_splines(grid[1], place[k, 1], work[2], work[3])
-        for a in range(4):
-            for b in range(4):
-                splines[k, 4 * a + b] = (first_x + a) * many + first_y + b
-                values[0, k, 4 * a + b] = work[0, a] * work[2, b]
-                values[1, k, 4 * a + b] = work[1, a] * work[2, b]
-                values[2, k, 4 * a + b] = work[0, a] * work[3, b]
-    return splines, values
-
-
-@_compiled(_f2, _f1, _f2)
+@_compiled(FLOATS_2, FLOATS_1, FLOATS_2)
 def surface_at(grid: FloatArray, coefficients: FloatArray, place: FloatArray) -> FloatArray:
     """Height, mm, and slopes by x and by y of a surface at places, shape (n, 2): shape (3, n)."""
     out, work = np.empty((3, len(place))), np.empty((4, 4))
@@ -100,12 +71,12 @@ def accumulate_splines(
     grid: FloatArray, x: float, y: float, share: float, work: FloatArray, out: FloatArray
 ) -> None:
     """Add to ``out`` the value of every spline at a place, times a share."""
-    many = int(grid[1, 3]) + 3
+    y_count = int(grid[1, 3]) + 3
     first_x = cubic_splines(grid[0], x, work[0], work[1])
     first_y = cubic_splines(grid[1], y, work[2], work[3])
     for a in range(4):
         for b in range(4):
-            out[(first_x + a) * many + first_y + b] += share * work[0, a] * work[2, b]
+            out[(first_x + a) * y_count + first_y + b] += share * work[0, a] * work[2, b]
 
 
 @_inner
@@ -128,11 +99,11 @@ def accumulate_at_boundary(
     out[-1] += share * part * part
 
 
-@_compiled(_f2, _i, _f2, _f1)
+@_compiled(FLOATS_2, INT, FLOATS_2, FLOATS_1)
 def gradient_of_sum(
     grid: FloatArray, count: int, place: FloatArray, share: FloatArray
 ) -> FloatArray:
-    """Derivative of Σ share · height at places by so many coefficients, shape (p,)."""
+    """Derivative of Σ share · height at places by p = ``count`` coefficients, shape (p,)."""
     out, work = np.zeros(count), np.empty((4, 4))
     for k in range(len(place)):
         accumulate_splines(grid, place[k, 0], place[k, 1], share[k], work, out)

@@ -1,6 +1,6 @@
-"""The rounds of the fit with their level, compiled (docs/adr/0018).
+"""The rounds of the fit with their level, compiled.
 
-Arguments mean the same as in `solver_kernels`.
+Arguments have the meanings that the package gives.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
+from labapp.core.compiled import BAND, BOOLS_1, FLOATS_1, FLOATS_2, FLOATS_3, INTS_1
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
 from labapp.core.surface.kernels.level_kernels import find_level, guess_level
@@ -15,14 +16,9 @@ from labapp.core.surface.kernels.solver_kernels import fit_step, newton_along_ra
 from labapp.core.surface.kernels.spline_kernels import surface_at
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
-_f, _i = types.float64, types.int64
-_f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
-_i1 = types.Array(_i, 1, "A", readonly=True)
-_b1 = types.Array(types.boolean, 1, "A", readonly=True)
-_lower = types.Array(_f, 2, "F", readonly=True)
-_fit = types.Tuple((_lower, _f2, _f3, _f1, _f2, _f2))  # type: ignore[no-untyped-call]
-_state = types.Tuple((_f1, _f1, _f2, _lower))  # type: ignore[no-untyped-call]
-_witnesses = types.Tuple((_b1, _f2, _i1, _f1, _f1))  # type: ignore[no-untyped-call]
+_fit = types.Tuple((BAND, FLOATS_2, FLOATS_3, FLOATS_1, FLOATS_2, FLOATS_2))  # type: ignore[no-untyped-call]
+_state = types.Tuple((FLOATS_1, FLOATS_1, FLOATS_2, BAND))  # type: ignore[no-untyped-call]
+_level_input = types.Tuple((BOOLS_1, FLOATS_2, INTS_1, FLOATS_1, FLOATS_1))  # type: ignore[no-untyped-call]
 
 FIRST_REACH, LEVEL_REACH, REACH_SIGMAS = 0.4, 0.3, 6.0
 """Least reach of the search for the level (`find_level`) around that of a given surface, and around
@@ -35,40 +31,40 @@ def _level_of_round(
     grid: FloatArray,
     coefficients: FloatArray,
     points: FloatArray,
-    witnesses: tuple[BoolArray, FloatArray, IntArray, FloatArray, FloatArray],
+    level_input: tuple[BoolArray, FloatArray, IntArray, FloatArray, FloatArray],
     level: FloatArray,
     limits: FloatArray,
 ) -> FloatArray:
     """The level of a surface after a round, see `run_rounds`."""
-    outer, landing, sign, sigma, spacing = witnesses
+    outer, landing, witness, sigma, spacing = level_input
     most, (head_sign, missing, drop_is_free, is_near) = limits[0], limits[5:9]
     if len(outer):
         shift, level_sigma, inner = guess_level(surface_at(grid, coefficients, points)[0], outer)
-        side = 1.0 if inner + shift > 0.0 else -1.0
-        return np.array([shift, level_sigma, side, 0.0, 0.0, -1.0, *np.zeros(5)])
+        pool_sign = 1.0 if inner + shift > 0.0 else -1.0
+        return np.array([shift, level_sigma, pool_sign, 0.0, 0.0, -1.0, *np.zeros(5)])
     # The drop is fixed in the second half of the rounds, as the iteration may oscillate.
     is_held = drop_is_free == 0.0 or 2 * count > most
     there = surface_at(grid, coefficients, landing)
-    height = np.empty((2, len(sign)))
+    height = np.empty((2, len(witness)))
     height[0], height[1] = there[0], sigma
     reach = LEVEL_REACH if count else FIRST_REACH
     if level[8] > 0.0:
         reach = min(max(reach, REACH_SIGMAS * level[1] / level[8]), 1.0)
     about = np.array([0.0, level[2], reach if count or is_near != 0.0 else np.nan])
-    rear = np.array([head_sign, level[3] if is_held else np.nan])
-    seen = height, there[1:].T, landing[:, 1], sign, spacing
-    found = find_level(*seen, rear, about, missing)
+    head_and_drop = np.array([head_sign, level[3] if is_held else np.nan])
+    seen = height, there[1:].T, landing[:, 1], witness, spacing
+    found = find_level(*seen, head_and_drop, about, missing)
     if is_held:
         found[1], found[9:] = max(found[1], level[1]), level[9:]
     return found
 
 
-@_compiled(_f2, _fit, _state, _witnesses, _f1, _f1)
+@_compiled(FLOATS_2, _fit, _state, _level_input, FLOATS_1, FLOATS_1)
 def run_rounds(
     grid: FloatArray,
     fit: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
     state: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    witnesses: tuple[BoolArray, FloatArray, IntArray, FloatArray, FloatArray],
+    level_input: tuple[BoolArray, FloatArray, IntArray, FloatArray, FloatArray],
     level: FloatArray,
     limits: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -82,13 +78,14 @@ def run_rounds(
         Stiffness, lower band, rays, shape (n, 3), weights, shape (n, 2, 2), laser, plane, and dots,
         shape (n, 3).
     state
-        Coefficients of the surface and of the one that it is held close to, shape (p,); reflection
-        points, shape (n, 3); factor of the normal matrix, of any value if not computed yet.
-    witnesses
+        Coefficients of the surface, and of the surface from which the roughness is counted
+        (``smooth_about``), shape (p,); reflection points, shape (n, 3); factor of the normal
+        matrix, of any value if not computed yet.
+    level_input
         Mask of the outer points from which the level is guessed, shape (n,), or empty; landing
-        points, shape (m, 3), signs, shape (m,), and uncertainty of the height there, shape (m,), of
-        the witnesses, and the spacing of the rays, shape (2,) (`level.Witnesses`). With neither an
-        outer point nor a witness the surface is not shifted.
+        points, shape (m, 3), +1 or −1, shape (m,), and uncertainty of the height there, shape (m,),
+        of the witnesses, and the spacing of the rays, shape (2,) (`level.Witnesses`). With neither
+        an outer point nor a witness the surface is not shifted.
     level
         Level before (`level_kernels.find_level`), shape (11,).
     limits
@@ -105,9 +102,9 @@ def run_rounds(
         without a surface, and 1 for a new factor.
     """
     stiffness, rays, weights, laser, plane, dots = fit
-    coefficients, smooth, points, factor = state
+    coefficients, smooth_about, points, factor = state
     most, until, steps, reuse, moved = limits[:5]
-    is_new, with_level = 0.0, len(witnesses[0]) + len(witnesses[2]) > 0
+    is_new, with_level = 0.0, len(level_input[0]) + len(level_input[2]) > 0
     for count in range(int(most)):
         if not moved <= reuse:  # NaN, too
             made, has_one = normal_factor(grid, stiffness, points, weights)
@@ -115,11 +112,13 @@ def run_rounds(
                 moved = np.nan
                 break
             factor, is_new = made, 1.0
-        rough, bench = coefficients - smooth, (laser, plane)
+        from_smooth, bench = coefficients - smooth_about, (laser, plane)
         bands = stiffness, factor
-        coefficients = fit_step(grid, bands, coefficients, rough, points, weights, bench, dots)
+        coefficients = fit_step(
+            grid, bands, coefficients, from_smooth, points, weights, bench, dots
+        )
         if with_level and not (count and abs(level[0]) < limits[9]):
-            at = grid, coefficients, points, witnesses, level, limits
+            at = grid, coefficients, points, level_input, level, limits
             level = _level_of_round(count, *at)
             coefficients += level[0]  # the splines add up to 1
         points, moved = newton_along_rays(grid, coefficients, rays, points, int(steps))

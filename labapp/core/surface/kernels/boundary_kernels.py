@@ -1,18 +1,13 @@
-"""The boundary of a pool and its sizes, compiled (docs/adr/0018).
+"""The boundary of a pool and its sizes, compiled.
 
-Arguments mean the same in all of these modules, all in the UCS and mm:
-
-* ``grid``: low end, high end, step and number of cells of the splines along x and along y, shape
-  (2, 4) (`SplineBasis.grid`); with it ``coefficients`` of the splines, shape (p,).
-* ``work``: memory to write on, which holds values and slopes of the four splines along x, then
-  those along y, shape (4, 4).
+Arguments have the meanings that the package gives.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import types
 
+from labapp.core.compiled import FLOAT, FLOATS_1, FLOATS_2, INT
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.surface.kernels.spline_kernels import (
     accumulate_at_boundary,
@@ -21,14 +16,11 @@ from labapp.core.surface.kernels.spline_kernels import (
 )
 from labapp.core.values import FloatArray
 
-_f, _i = types.float64, types.int64
-_f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 4))
-
 MOST_BOUNDARY_STEPS = 20
 """Newton steps along a direction, if the boundary does not settle before."""
 
 
-@_compiled(_f2, _f1, _f1, _f1, _f2, _f1, _f1, _f)
+@_compiled(FLOATS_2, FLOATS_1, FLOATS_1, FLOATS_1, FLOATS_2, FLOATS_1, FLOATS_1, FLOAT)
 def newton_to_boundary(
     grid: FloatArray,
     coefficients: FloatArray,
@@ -43,10 +35,8 @@ def newton_to_boundary(
 
     Parameters
     ----------
-    grid, coefficients
-        See the module.
-    rear
-        `Rear.as_array`: the height that the boundary has at y.
+    grid, coefficients, rear
+        See the package.
     center, way, radius
         Where directions start, shape (2,), unit vectors along them, shape (m, 2), and how far out
         the steps begin, shape (m,), mm.
@@ -84,7 +74,7 @@ def newton_to_boundary(
 # --- sizes --------------------------------------------------------------------------------------
 
 
-@_compiled(_f2, _f1, _f2, _f1, _f1, _f1, _f1, _i)
+@_compiled(FLOATS_2, FLOATS_1, FLOATS_2, FLOATS_1, FLOATS_1, FLOATS_1, FLOATS_1, INT)
 def spokes(
     grid: FloatArray,
     coefficients: FloatArray,
@@ -97,15 +87,15 @@ def spokes(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sample a surface at fractions of the way from a centre to each ``stride``-th boundary point.
 
-    The outline is the m boundary points, shape (m, 3), m a multiple of ``stride``. The rear is
-    `Rear.as_array`.
+    The number of boundary points is a multiple of ``stride``.
 
     Returns
     -------
     samples, over, share
-        Places with their height, shape (n, 3); height over that of the boundary, shape (n,); what a
-        sample counts in the volume, shape (n,): its weight times its share of the wedges of all
-        boundary points (`measures.wedges`), those between two spokes shared by how near they are.
+        Places with their height, shape (n, 3); height over that of the boundary, shape (n,); weight
+        of a sample in the volume, shape (n,): that on its spoke times its share of the wedges of
+        all boundary points (`measures.wedges`), those between two spokes shared by how near they
+        are.
     """
     count, rings, work = len(outline), len(fraction), np.empty((4, 4))
     wedge = np.empty(count)
@@ -134,7 +124,7 @@ def spokes(
     return samples, over, share
 
 
-@_compiled(_f2, _i, _f2, _f1, _f2, _f2, _f1, _f1)
+@_compiled(FLOATS_2, INT, FLOATS_2, FLOATS_1, FLOATS_2, FLOATS_2, FLOATS_1, FLOATS_1)
 def size_gradients(
     grid: FloatArray,
     count: int,
@@ -147,9 +137,8 @@ def size_gradients(
 ) -> FloatArray:
     """Derivatives of width, length, area and volume, shape (4, p + 1).
 
-    They are by p = ``count`` coefficients and by the drop of the rear (`Rear.as_array`). Samples
-    and what they count in the volume are those of `spokes`; ``boundary_slope`` is the gradient of
-    the surface's height over the boundary's at each boundary point, shape (m, 2).
+    They are by p = ``count`` coefficients and by the drop of the rear. Samples and their weights in
+    the volume, ``share``, are those of `spokes`.
     """
     out, work = np.zeros((4, count + 1)), np.empty((4, 4))
     for axis in range(2):
