@@ -5,20 +5,16 @@ Used before and during capture: exposure, blur, rows, reference and expected ± 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from labapp.core.geometry.bench import Bench
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.exposure import Exposure, judge_exposure
-from labapp.core.images.find_dots import find_dots
-from labapp.core.pipeline import Measurement, Settings, measure
-from labapp.core.rows.find_lattice import find_lattice
+from labapp.core.pipeline import Measurement
 from labapp.core.rows.lattice import Lattice
 from labapp.core.surface.measures import Measures
-from labapp.core.values import CannotMeasure
 
 Grade = Literal["good", "doubtful", "bad"]
 """Good; measurable, but with reduced quality; not measurable."""
@@ -32,14 +28,8 @@ merge: in the sample runs, a further blur of 2 px loses dots."""
 FEW = 0.1
 """Smallest acceptable share of rays with dots; the sample runs have 0.18 to 0.27."""
 
-MANY = 1.5
-"""Largest ratio of dots to rays; merged or blurred dots break up into noise above it."""
-
 HOLE = 0.5
 """No dot is closer to the reference than this fraction of the dot spacing."""
-
-USUAL_RAYS = 361
-"""Number of rays assumed if the lens is unknown."""
 
 UNMEASURED = "not-measured"
 """Status of a frame without a set-up."""
@@ -75,24 +65,11 @@ class Quality:
     ----------
     exposure
         Levels, saturation, contrast, merging.
-    dots
-        Number of dots found.
-    blocked_rows
-        Number of rows with dots hidden by the torch, if rays could be matched.
-    reference
-        Whether the hole of the absent ray is visible, if rays could be matched.
-    height_sigma_mm
-        Standard uncertainty of the height (of the depth for a concave pool), mm; NaN if the frame
-        cannot be measured or the scheme gives none.
     remarks
         Assessments, the worst first.
     """
 
     exposure: Exposure
-    dots: int
-    blocked_rows: int
-    reference: bool
-    height_sigma_mm: float
     remarks: tuple[Remark, ...]
 
     @property
@@ -107,46 +84,11 @@ class Quality:
         return " ".join(wrong) or self.remarks[0].words
 
 
-def look(
-    image: Image,
-    settings: Settings,
-    bench: Bench | None = None,
-) -> Measurement:
-    """Measure a frame; without a set-up find only its dots and rows.
-
-    Parameters
-    ----------
-    image
-        Grey levels, shape (rows, columns).
-    settings
-        Settings of the measurement.
-    bench
-        Bench; None if it is unknown.
-    """
-    height, width = image.shape
-    found = Measurement(UNMEASURED, "there is no set-up yet", settings.scheme)
-    try:
-        dots = find_dots(image, settings.dots)
-        found = replace(found, dots=dots)
-        rays = USUAL_RAYS if bench is None else bench.rig.pattern.rows * bench.rig.pattern.columns
-        if len(dots) > MANY * rays:
-            # The search for rows among them would take minutes.
-            words = f"{len(dots)} spots stand out, where the lens makes {rays} dots at most"
-            raise CannotMeasure("too-many-dots", words)
-        if bench is not None:
-            return measure(image, bench, settings)[0]
-        lattice = find_lattice(dots, (height, width), settings.lattice)
-        return replace(found, lattice=lattice)
-    except CannotMeasure as answer:
-        return replace(found, status=answer.status, reason=answer.reason)
-
-
 def judge_quality(
     image: Image,
     measurement: Measurement,
     bit_depth: int | None,
     rays: int | None = None,
-    most_sigma_mm: float | None = None,
 ) -> Quality:
     """Judge a frame by its grey levels and its measurement.
 
@@ -155,31 +97,26 @@ def judge_quality(
     image
         Grey levels, shape (rows, columns).
     measurement
-        Its measurement, from `look` or the live chain.
+        Its measurement by the live chain.
     bit_depth
         Significant bits of a grey level; None if unknown.
     rays
         Number of rays of the lens; None if unknown.
-    most_sigma_mm
-        Largest acceptable standard uncertainty of the height, mm.
     """
-    dots, sizes = measurement.dots, measurement.measures
+    dots = measurement.dots
     # Without a match, a hole in the rows or at their ends is only a candidate.
     lattice = measurement.lattice if measurement.match is not None else None
     exposure = judge_exposure(image, dots, bit_depth)
     blocked = 0 if lattice is None else len(lattice.blocked_rows)
-    reference = lattice is not None and dots is not None and _hole_seen(dots, lattice)
-    sigma_mm = float("nan") if sizes is None else _peak_sigma(sizes)
     remarks = [_of_exposure(exposure)]
     if dots is not None and len(dots):
         remarks.append(_of_blur(exposure))
         remarks.append(_of_rows(dots, blocked, rays))
         if lattice is not None:
-            remarks.append(_of_reference(reference))
-        remarks += _of_measurement(measurement, sigma_mm, most_sigma_mm)
+            remarks.append(_of_reference(_hole_seen(dots, lattice)))
+        remarks += _of_measurement(measurement)
     remarks.sort(key=lambda remark: -GRADES.index(remark.grade))  # stable: order of assessment
-    count = 0 if dots is None else len(dots)
-    return Quality(exposure, count, blocked, reference, sigma_mm, tuple(remarks))
+    return Quality(exposure, tuple(remarks))
 
 
 def _of_exposure(exposure: Exposure) -> Remark:
@@ -237,22 +174,18 @@ def _hole_seen(dots: Dots, lattice: Lattice) -> bool:
     return False
 
 
-def _of_measurement(
-    measurement: Measurement, sigma_mm: float, most_mm: float | None
-) -> list[Remark]:
+def _of_measurement(measurement: Measurement) -> list[Remark]:
     if measurement.status == UNMEASURED:
         return []
     if measurement.status != "ok":
         reason = measurement.reason[:1].upper() + measurement.reason[1:]
         return [Remark("measurement", "bad", f"{reason} ({measurement.status}).")]
     found = [Remark("measurement", "good", "The frame can be measured.")]
+    sigma_mm = float("nan") if measurement.measures is None else _peak_sigma(measurement.measures)
     if not np.isfinite(sigma_mm):
         return found
-    known = f"The height will be known to ± {sigma_mm:.3f} mm"
-    if most_mm is not None and sigma_mm > most_mm:
-        words = f"{known}, not to ± {most_mm:g} mm: sharper or brighter dots, or more of them."
-        return [*found, Remark("height ±", "doubtful", words)]
-    return [*found, Remark("height ±", "good", f"{known}.")]
+    words = f"The height will be known to ± {sigma_mm:.3f} mm."
+    return [*found, Remark("height ±", "good", words)]
 
 
 def _peak_sigma(sizes: Measures) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from labapp.core.dynamics.analysis import Dynamics, DynamicsSettings, analyse
 from labapp.core.dynamics.modes import RHO, RINGS, SPOKES, ModeCourse, SurfaceSeries
-from labapp.core.dynamics.steps import QUANTITIES
+from labapp.core.dynamics.steps import RESPONSE_QUANTITIES
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import CloughTocherSurface
 from labapp.core.surface.measures import SHAPES, SIZES, WITH_SIGMA, sigma_names
@@ -174,11 +174,13 @@ def _event_rows(found: Dynamics) -> Iterator[list[str]]:
 
 
 def _response_rows(found: Dynamics) -> Iterator[list[str]]:
-    names = [f"{name}{part}" for name in QUANTITIES for part in ("", "_sigma")]
+    names = [f"{name}{part}" for name in RESPONSE_QUANTITIES for part in ("", "_sigma")]
     yield ["signal", "series", "step_s", "signal_change", "order", "before", *names]
     for one in found.responses:
         step, fit = one.step, one.response
-        pairs = [number_cell(of[name]) for name in QUANTITIES for of in (fit.value, fit.sigma)]
+        pairs = [
+            number_cell(of[name]) for name in RESPONSE_QUANTITIES for of in (fit.value, fit.sigma)
+        ]
         where = [one.signal, one.series, number_cell(step.time_s), number_cell(step.change)]
         yield [*where, str(fit.order), number_cell(fit.before), *pairs]
 

@@ -10,9 +10,9 @@ import pytest
 
 from labapp.config.setup_keys import SECTIONS
 from labapp.core.calibration.board_calibration import BoardCalibration, calibrate_board
-from labapp.core.calibration.boards import BOARDS, parse_board
+from labapp.core.calibration.boards import BOARDS, BoardCorners, parse_board
 from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
-from labapp.core.calibration.lens_fit import PlaneView, fit_lens, fit_terms
+from labapp.core.calibration.lens_fit import fit_lens, fit_terms
 from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
 from labapp.core.values import CannotMeasure
 from labapp.simulation.calibration.target import Target, TargetLook, render_target
@@ -95,7 +95,7 @@ def test_distortion_error_over_sigma_is_standard_normal():
             (40.0, 36.0), 5.0, turned_deg=tuple(rng.normal(0, 2, 3)), lens=lens(-0.8)
         )
         image_px = view.to_image(CHARUCO.corners_mm) + rng.normal(0, 0.05, (110, 2))
-        fit = fit_terms([PlaneView(CHARUCO.corners_mm, image_px)], SIZE, ("k1",))
+        fit = fit_terms([BoardCorners(CHARUCO, np.arange(110), image_px)], SIZE, ("k1",))
         value, sigma = fit.distortion_percent()
         pulls.append((value + 0.8) / sigma)
     assert 0.75 < np.std(pulls) < 1.3
@@ -108,7 +108,7 @@ def test_no_lens_is_fitted_to_noise():
     image_px = view.to_image(CHARUCO.corners_mm)
     lenses = [
         fit_lens(
-            [PlaneView(CHARUCO.corners_mm, image_px + rng.normal(0, 0.05, (110, 2)))], SIZE
+            [BoardCorners(CHARUCO, np.arange(110), image_px + rng.normal(0, 0.05, (110, 2)))], SIZE
         ).lens
         for _ in range(100)
     ]
@@ -121,7 +121,9 @@ def test_covariance_matches_spread_over_repeated_noise():
     image_px, places = view.to_image(CHARUCO.corners_mm), np.array([[0.0, 0.0], [80.0, 0.0]])
     fits = [
         fit_terms(
-            [PlaneView(CHARUCO.corners_mm, image_px + rng.normal(0, 0.05, (110, 2)))], SIZE, ("k1",)
+            [BoardCorners(CHARUCO, np.arange(110), image_px + rng.normal(0, 0.05, (110, 2)))],
+            SIZE,
+            ("k1",),
         )
         for _ in range(80)
     ]

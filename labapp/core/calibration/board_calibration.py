@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from labapp.core.calibration.boards import Board, BoardCorners, find_board
-from labapp.core.calibration.lens_fit import LensFit, PlaneView, covered, fit_lens, fit_terms
+from labapp.core.calibration.lens_fit import LensFit, covered, fit_lens, fit_terms
 from labapp.core.calibration.seen_axes import POINTS, SeenAxes
 from labapp.core.calibration.target_marks import ColourOrGrey
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -71,7 +71,7 @@ class BoardCalibration(SeenAxes):
     @cached_property
     def fit(self) -> LensFit:
         """Lens and homographies."""
-        return fit_lens(_views(self.seen), self.size_px)
+        return fit_lens(self.seen, self.size_px)
 
     @cached_property
     def distortion_percent(self) -> tuple[float, float]:
@@ -82,7 +82,7 @@ class BoardCalibration(SeenAxes):
         if "k1" in self.fit.terms:
             return self.fit.distortion_percent()
         terms = (*self.fit.terms, "k1")
-        value, sigma = fit_terms(_views(self.seen), self.size_px, terms).distortion_percent()
+        value, sigma = fit_terms(self.seen, self.size_px, terms).distortion_percent()
         return 0.0, max(abs(value), sigma)
 
     @property
@@ -114,7 +114,7 @@ class BoardCalibration(SeenAxes):
     @property
     def covered(self) -> float:
         """Share of the picture spanned by the corners of all pictures together."""
-        return covered(_views(self.seen), self.size_px)
+        return covered(self.seen, self.size_px)
 
     @cached_property
     def corner_sigma_mm(self) -> float:
@@ -244,7 +244,3 @@ def _without_strays(found: BoardCalibration) -> BoardCalibration:
             one.keep(~which) for one, which in zip(found.seen, np.split(stray, ends), strict=True)
         )
         found = BoardCalibration(found.size_px, tuple(kept), left_out)
-
-
-def _views(seen: Sequence[BoardCorners]) -> list[PlaneView]:
-    return [PlaneView(one.plane_mm, one.image_px) for one in seen]

@@ -16,8 +16,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 
+from labapp.core.calibration.boards import BoardCorners
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
@@ -35,22 +37,6 @@ LEAST_COVERED = 0.35
 
 GROUPS = (("k1",), ("p1", "p2"), ("k2",))
 """Terms that are included together."""
-
-
-@dataclass(frozen=True)
-class PlaneView(ReadOnlyArrays):
-    """Known points on a plane and their positions in a picture.
-
-    Parameters
-    ----------
-    plane_mm
-        (X, Z) of each, shape (n, 2), mm.
-    image_px
-        (u, v) of each, shape (n, 2), px.
-    """
-
-    plane_mm: FloatArray
-    image_px: FloatArray
 
 
 @dataclass(frozen=True)
@@ -102,24 +88,26 @@ class LensFit(ReadOnlyArrays):
             return None
         return _lens(self.size_px, _coefficients(self.terms, self.parameters))
 
-    def calibration(self, picture: int = 0) -> ImageCalibration:
-        """Image calibration of one of the pictures."""
-        x, z, size = self.frames[picture].tolist()
+    def calibration(self) -> ImageCalibration:
+        """Image calibration of the first picture."""
+        x, z, size = self.frames[0].tolist()
         to_unit = np.array([[1.0, 0.0, -x], [0.0, 1.0, -z], [0.0, 0.0, size]]) / size
         focal, middle = _scale(self.size_px), _middle(self.size_px)
         to_px = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
-        unit = np.append(self.parameters[8 * picture : 8 * picture + 8], 1.0).reshape(3, 3)
+        unit = np.append(self.parameters[:8], 1.0).reshape(3, 3)
         matrix = np.asarray(np.linalg.inv(to_px @ unit @ to_unit), np.float64)
         return ImageCalibration(matrix / matrix[2, 2], self.lens)
 
-    def covariance_px2(self, plane_mm: FloatArray, picture: int = 0) -> FloatArray:
-        """Covariance, shape (2n, 2n), px², of the image positions of (X, Z), shape (n, 2), mm."""
-        unit = (plane_mm - self.frames[picture, :2]) / self.frames[picture, 2]
+    def covariance_px2(self, plane_mm: FloatArray) -> FloatArray:
+        """Covariance of the positions in the first picture of (X, Z), shape (n, 2), mm.
+
+        Its shape is (2n, 2n), px².
+        """
+        unit = (plane_mm - self.frames[0, :2]) / self.frames[0, 2]
         coefficients = _coefficients(self.terms, self.parameters)
-        own = self.parameters[8 * picture : 8 * picture + 8]
-        _, by_plane, by_term = _seen(unit, own, coefficients, _scale(self.size_px))
+        _, by_plane, by_term = _seen(unit, self.parameters[:8], coefficients, _scale(self.size_px))
         slopes = np.zeros((2 * len(plane_mm), len(self.parameters)))
-        slopes[:, 8 * picture : 8 * picture + 8] = by_plane
+        slopes[:, :8] = by_plane
         chosen = [TERMS.index(term) for term in self.terms]
         slopes[:, len(self.parameters) - len(chosen) :] = by_term[:, chosen]
         return np.asarray(slopes @ self.covariance @ slopes.T)
@@ -135,13 +123,13 @@ class LensFit(ReadOnlyArrays):
         return float(of @ self.parameters[first:]), float(np.sqrt(variance))
 
 
-def fit_lens(views: Sequence[PlaneView], size_px: tuple[int, int]) -> LensFit:
+def fit_lens(views: Sequence[BoardCorners], size_px: tuple[int, int]) -> LensFit:
     """Fit a lens, with the significant distortion terms, and a homography to each picture.
 
     Parameters
     ----------
     views
-        Points seen in each picture: at least 5 that span the plane, at least 12 in total.
+        Corners seen in each picture: at least 5 that span the plane, at least 12 in total.
     size_px
         Width and height of the pictures.
 
@@ -168,7 +156,7 @@ def fit_lens(views: Sequence[PlaneView], size_px: tuple[int, int]) -> LensFit:
         left.remove(group)
 
 
-def covered(views: Sequence[PlaneView], size_px: tuple[int, int]) -> float:
+def covered(views: Sequence[BoardCorners], size_px: tuple[int, int]) -> float:
     """Share of the picture spanned by the points of all pictures together (convex hull)."""
     from scipy.spatial import ConvexHull
 
@@ -177,7 +165,7 @@ def covered(views: Sequence[PlaneView], size_px: tuple[int, int]) -> float:
 
 
 def fit_terms(
-    views: Sequence[PlaneView], size_px: tuple[int, int], terms: Sequence[str]
+    views: Sequence[BoardCorners], size_px: tuple[int, int], terms: Sequence[str]
 ) -> LensFit:
     """Fit a lens with given distortion terms, see `fit_lens`."""
     from scipy.optimize import least_squares
@@ -247,41 +235,24 @@ def _seen(
     in px.
     """
     ones = np.column_stack([unit, np.ones(len(unit))])
-    rows = np.append(homography, 1.0).reshape(3, 3) @ ones.T
-    weight = rows[2]
-    x, y = rows[0] / weight, rows[1] / weight
+    *place, weight = np.append(homography, 1.0).reshape(3, 3) @ ones.T
+    x, y = place / weight
     k1, p1, p2, k2 = coefficients
-    square = x * x + y * y
-    radial, grows = 1.0 + square * (k1 + square * k2), k1 + 2.0 * square * k2
-    seen = np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x),
-            y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=-1,
+    # OpenCV projects points in space, here at unit distance before an unmoved camera.
+    camera, still = np.diag([focal, focal, 1.0]), np.zeros(3)
+    points = np.column_stack([x, y, np.ones(len(x))])
+    lens = np.array([k1, k2, p1, p2])
+    found: tuple[FloatArray, FloatArray] = cv2.projectPoints(  # type: ignore[assignment]
+        points, still, still, camera, lens
     )
-    mixed = 2.0 * (x * y * grows + p1 * x + p2 * y)
-    bent = np.array(
-        [
-            [radial + 2.0 * x * x * grows + 2.0 * p1 * y + 6.0 * p2 * x, mixed],
-            [mixed, radial + 2.0 * y * y * grows + 6.0 * p1 * y + 2.0 * p2 * x],
-        ]
-    )
+    image_px, slopes = found
+    by_place = slopes[:, 3:5].reshape(-1, 2, 2)  # w.r.t. the shift, which is that of x and y
     straight = np.zeros((2, 8, len(x)))
     straight[0, :3] = straight[1, 3:6] = ones.T
     straight[:, 6:] = -np.stack([x, y])[:, None] * ones.T[:2]
-    by_plane = np.einsum("ijn,jkn->nik", bent, straight / weight)
-    by_term = np.array(
-        [
-            [x * square, 2.0 * x * y, square + 2.0 * x * x, x * square**2],
-            [y * square, square + 2.0 * y * y, 2.0 * x * y, y * square**2],
-        ]
-    )
-    return (
-        seen,
-        focal * by_plane.reshape(-1, 8),
-        focal * by_term.transpose(2, 0, 1).reshape(-1, len(TERMS)),
-    )
+    by_plane = np.einsum("nij,jkn->nik", by_place, straight / weight)
+    by_term = slopes[:, [10, 12, 13, 11]]
+    return image_px.reshape(-1, 2) / focal, by_plane.reshape(-1, 8), by_term
 
 
 def _homography(unit: FloatArray, place: FloatArray) -> FloatArray:

@@ -110,11 +110,6 @@ class MarkFits:
         the uncertainty left by the marks; None if there are too few marks.
     corner_mm
         X′ = Z′ of the far corner of the region of the dots, mm.
-    chance
-        p-value of perspective (F-test).
-    affine_error_mm, homography_error_mm
-        Expected root-mean-square error of each fit in the region of the dots; NaN without a
-        homography.
     best
         The better model.
     reason
@@ -125,9 +120,6 @@ class MarkFits:
     homography: MarkFit | None
     whole: MarkFit | None
     corner_mm: float
-    chance: float
-    affine_error_mm: float
-    homography_error_mm: float
     best: Model
     reason: str
 
@@ -229,7 +221,7 @@ def fit_marks(
             f"perspective: {FEWEST_ON_AXIS} on each and {FEWEST_MARKS} in all are needed"
         )
         corner = FIELD * float(np.abs(plane_mm).max())
-        return MarkFits(affine, None, None, corner, 1.0, np.nan, np.nan, "affine", reason)
+        return MarkFits(affine, None, None, corner, "affine", reason)
     whiten = _by_scatter(plane_mm, image_px, noise, affine)
     affine, *fits = (_fit(plane_mm, image_px, AFFINE + more, whiten) for more in ((), *PERSPECTIVE))
     return _chosen(affine, fits, float(np.abs(plane_mm).max()))
@@ -278,9 +270,6 @@ def _chosen(affine: MarkFit, fits: list[MarkFit], axis_mm: float) -> MarkFits:
         homography=homography,
         whole=fits[2],
         corner_mm=FIELD * axis_mm,
-        chance=chance,
-        affine_error_mm=affine_error,
-        homography_error_mm=error,
         best=best,
         reason=reason,
     )

@@ -25,7 +25,7 @@ uncertainty of their difference is at most σ√2."""
 LONGEST = 10_000_000
 """Longest series, in steps between frames, that fits into memory as evenly spaced samples."""
 
-MOST_STEPS = 8
+MOST_SIGNAL_STEPS = 8
 """A signal with more changes is pulsed: responses to its individual steps are not analysed."""
 
 
@@ -160,7 +160,7 @@ def _responses(
     """Fit responses of every series to every step of signals with few steps, until the next one."""
     found = []
     for signal, events in steps.items():
-        if len(events) > MOST_STEPS:
+        if len(events) > MOST_SIGNAL_STEPS:
             continue
         ends = [*(one.time_s for one in events), np.inf]
         for k, event in enumerate(events):

@@ -1,11 +1,13 @@
-"""Static maps from filtered features to penetration: linear function and Gaussian process."""
+"""Static maps from filtered features to penetration: linear function and Gaussian process.
+
+They map standardised regressors to penetration minus its mean.
+"""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from scipy import linalg
@@ -16,13 +18,6 @@ MOST_POINTS, SEARCHED_POINTS = 600, 200
 """Largest numbers of sections of a Gaussian process: kept, and used to fit its parameters."""
 
 
-class StaticMap(Protocol):
-    """Map from standardised regressors to penetration minus its mean."""
-
-    def evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return value, variance and gradient at ``x``, shapes (n,), (n,), (n, d)."""
-
-
 @dataclass(frozen=True)
 class LinearMap(ReadOnlyArrays):
     """B(q) and c: weights, the constant last, shape (d + 1,), and their covariance matrix."""
@@ -31,7 +26,7 @@ class LinearMap(ReadOnlyArrays):
     covariance: FloatArray
 
     def evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `StaticMap`."""
+        """Return value, variance and gradient at ``x``, shapes (n,), (n,), (n, d)."""
         columns = np.column_stack([x, np.ones(len(x))])
         variance = np.einsum("ni,ij,nj->n", columns, self.covariance, columns)
         return columns @ self.weights, variance, np.tile(self.weights[:-1], (len(x), 1))
@@ -74,7 +69,7 @@ class GaussianMap(ReadOnlyArrays):
         return np.asarray(linalg.cho_solve((self.factor, True), self.values))
 
     def evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `StaticMap`."""
+        """As `LinearMap.evaluate`."""
         cross = self.covariance(x)
         part = linalg.solve_triangular(self.factor, cross.T, lower=True)
         weighted = cross * self.weights
@@ -113,7 +108,7 @@ def fit_linear(rows: Sections) -> tuple[LinearMap, float]:
     return LinearMap(weights, inverse * variance), max(variance - float(known.mean()), 0.0)
 
 
-def fit_gaussian(rows: Sections, like: StaticMap | None) -> tuple[GaussianMap, float]:
+def fit_gaussian(rows: Sections, like: LinearMap | GaussianMap | None) -> tuple[GaussianMap, float]:
     """Fit a Gaussian process by maximum likelihood; also return the unexplained variance, mm²."""
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel

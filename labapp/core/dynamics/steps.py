@@ -54,7 +54,7 @@ class Event:
     slope_change_per_s: float
 
 
-QUANTITIES = ("change", "delay_s", "time_constant_s", "rise_time_s", "overshoot")
+RESPONSE_QUANTITIES = ("change", "delay_s", "time_constant_s", "rise_time_s", "overshoot")
 """Quantities of a step response: final change of the series, in its unit; time from the step to the
 beginning of the response; τ of the first order, or the settling constant 1/(ζω₀) of the second;
 rise time from 10 to 90 % of the change; overshoot as a share of the change, 0 for first order."""
@@ -71,7 +71,7 @@ class StepResponse(ReadOnlyArrays):
     before
         Level of the series before the step.
     value, sigma
-        Values and standard uncertainties of `QUANTITIES`, by name.
+        Values and standard uncertainties of `RESPONSE_QUANTITIES`, by name.
     order
         1 or 2.
     fitted
@@ -179,8 +179,8 @@ def step_response(time_s: FloatArray, values: FloatArray, step_s: float) -> Step
         [(quantities(best.x + d) - quantities(best.x - d)) / (2 * d.max()) for d in np.diag(steps)]
     )
     sigma = np.sqrt(np.einsum("ij,jk,ik->i", slope, covariance, slope))
-    found = dict(zip(QUANTITIES, quantities(best.x).tolist(), strict=True))
-    known = dict(zip(QUANTITIES, sigma.tolist(), strict=True))
+    found = dict(zip(RESPONSE_QUANTITIES, quantities(best.x).tolist(), strict=True))
+    known = dict(zip(RESPONSE_QUANTITIES, sigma.tolist(), strict=True))
     course = np.stack([time_s, model(best.x, time)])
     return StepResponse(step_s, float(best.x[0]), found, known, order, course)
 

@@ -14,7 +14,7 @@ from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 MOST_HELD = 5
 """Largest number of steps without a frame for which the previous features are held."""
 
-MOST_STEPS = 1_000_000
+MOST_TIME_STEPS = 1_000_000
 """Largest number of steps of a weld."""
 
 LONGEST_MEMORY = 10_000
@@ -62,15 +62,15 @@ def in_steps(weld: WeldSeries, step_s: float) -> WeldSeries:
     Raises
     ------
     ValueError
-        If there are no frames, or more than `MOST_STEPS`.
+        If there are no frames, or more than `MOST_TIME_STEPS`.
     """
     there = np.isfinite(weld.value).all(axis=1)
     if not there.any():
         raise ValueError(f"{weld.name} has no frame with all features")
     time_s, value = weld.time_s[there], weld.value[there]
     low, high = np.floor(np.array([time_s[0], weld.time_s[-1]]) / step_s + 1e-9)
-    if high - low >= MOST_STEPS:
-        raise ValueError(f"{weld.name} has more than {MOST_STEPS} steps of {step_s:g} s")
+    if high - low >= MOST_TIME_STEPS:
+        raise ValueError(f"{weld.name} has more than {MOST_TIME_STEPS} steps of {step_s:g} s")
     count = int(high - low) + 1
     place = (np.floor(time_s / step_s + 1e-9) - low).astype(int)
 

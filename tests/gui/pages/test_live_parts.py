@@ -59,10 +59,6 @@ from tests.waiting import PATIENCE_S, connect
 MEASURES = Measures(*[0.0] * 4, 6.7, 7.5, 0.30, -0.01, *[0.0] * 6, *[0.03, 0.04, 0.003] * 2)
 QUALITY = Quality(
     Exposure(0.4, 0.0, 0.5, 20.0, 0.5, "good"),
-    100,
-    0,
-    True,
-    0.003,
     (Remark("exposure", "good", "The dots stand out well."),),
 )
 OK = Measurement("ok", "", "fit", measures=MEASURES)
