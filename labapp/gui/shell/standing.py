@@ -57,7 +57,7 @@ DOUBTFUL = (FrameStatus.DOUBTFUL, FrameStatus.NOT_MEASURABLE)
 
 def standings(seen: Overview) -> IntArray:
     """State of every frame, values of `FrameStatus`, shape (n,)."""
-    from labapp.session.results.trends import doubtful_frames
+    from labapp.session.results.trends import outlying_frames
 
     status = np.array(seen.status, dtype=object)
     measured, fine = status != "", np.isin(status, ("ok", "followed"))
@@ -65,7 +65,7 @@ def standings(seen: Overview) -> IntArray:
     found = np.where(seen.corrected & (fine | ~measured), FrameStatus.CORRECTED, found)
     found = np.where(measured & ~fine, FrameStatus.NOT_MEASURABLE, found)
     found = np.where(status == "pulse", FrameStatus.PULSE, found)
-    doubtful = (measured & seen.stale) | (fine & doubtful_frames(seen))
+    doubtful = (measured & seen.stale) | (fine & outlying_frames(seen))
     return np.asarray(np.where(doubtful, FrameStatus.DOUBTFUL, found), np.int64)
 
 
