@@ -74,3 +74,11 @@ def write_file(path: Path, content: bytes) -> Path:
     with os_errors_as_input(path, "file", "one that can be written"):
         write_atomically(path, content)
     return path
+
+
+def relative_path(path: Path, folder: Path) -> str:
+    """Return a path relative to a folder, with ``/``; absolute if there is no relative path."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # on another drive
+        return path.absolute().as_posix()

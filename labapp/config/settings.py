@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.matching.match_settings import MatchSettings
@@ -78,3 +79,15 @@ def check_algorithm(settings: Settings, source: str | Path, field: str = "algori
 def _choices(owner: type, field: str) -> tuple[str, ...]:
     """Values that the type of a field allows."""
     return get_args(get_type_hints(owner)[field])
+
+
+def differences(value: Any, usual: Any, within: str = "") -> dict[str, tuple[Any, Any]]:
+    """Return the fields of a dataclass that differ: full dotted name → own and usual value."""
+    found: dict[str, tuple[Any, Any]] = {}
+    for field in fields(value):
+        mine, other = getattr(value, field.name), getattr(usual, field.name)
+        if is_dataclass(mine) and type(mine) is type(other):
+            found |= differences(mine, other, f"{within}{field.name}.")
+        elif mine != other:
+            found[within + field.name] = mine, other
+    return found

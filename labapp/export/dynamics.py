@@ -39,11 +39,11 @@ FILM_FRAMES, FILM_HZ, FILM_PERIODS = 48, 24.0, 3
 FILM_SWING = 0.3
 """Amplitude in the film, as a fraction of the pool's largest height."""
 
-Measured = tuple[int, float, Surface, Boundary, Mapping[str, float]]
+MeasuredSurface = tuple[int, float, Surface, Boundary, Mapping[str, float]]
 """Frame, time (s), surface, boundary, and sizes by name."""
 
 
-def measured_of(results: Iterable[FrameResult]) -> Iterator[Measured]:
+def measured_of(results: Iterable[FrameResult]) -> Iterator[MeasuredSurface]:
     """Yield the frames that have a surface.
 
     Raises
@@ -66,7 +66,7 @@ def no_time_base() -> InputError:
 
 
 def dynamics_of(
-    measured: Iterable[Measured],
+    measured: Iterable[MeasuredSurface],
     signals: Mapping[str, tuple[FloatArray, FloatArray]] | None = None,
     settings: DynamicsSettings | None = None,
 ) -> Dynamics:

@@ -23,7 +23,7 @@ from labapp.core.dynamics.weld_series import WeldSeries
 from labapp.core.surface.measures import WITH_SIGMA, sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.export.dynamics import Measured
+from labapp.export.dynamics import MeasuredSurface
 from labapp.files import as_bytes, write_file
 from labapp.text import csv_text, number_cell
 
@@ -67,7 +67,7 @@ def weld_series(
 
 
 def measured_series(
-    name: str, measured: Iterable[Measured], features: Sequence[str] = WITH_SIGMA
+    name: str, measured: Iterable[MeasuredSurface], features: Sequence[str] = WITH_SIGMA
 ) -> WeldSeries:
     """Return features of the frames of a session or a results folder.
 

@@ -21,7 +21,7 @@ from labapp.errors import InputError
 
 if TYPE_CHECKING:
     from labapp.core.surface.reconstruction import Reconstruction
-    from labapp.export.tables import Table
+    from labapp.export.tables import Columns
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class RunWriter(Protocol):
     """Context manager that writes a run into one file, frame by frame."""
 
     def write(
-        self, frame: int, tables: Mapping[str, Table], reconstruction: Reconstruction | None
+        self, frame: int, tables: Mapping[str, Columns], reconstruction: Reconstruction | None
     ) -> None:
         """Add a frame.
 

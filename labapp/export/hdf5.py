@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from labapp.core.surface.mesh import grid_nodes
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.export.tables import TABLES, Column, Table
+from labapp.export.tables import TABLES, Column, Columns
 from labapp.files import as_bytes
 
 TEXT_BYTES = 8
@@ -66,7 +66,7 @@ class Hdf5Writer:
 
     def __init__(self, path: Path, attributes: Mapping[str, object], spacing_mm: float) -> None:
         self._spacing_mm = spacing_mm
-        self._measures: list[Table] = []
+        self._measures: list[Columns] = []
         self._disk = _Disk(path)
         try:
             self._file = h5py.File(self._disk, "w", libver=LIBRARY)
@@ -79,7 +79,7 @@ class Hdf5Writer:
             raise
 
     def write(
-        self, frame: int, tables: Mapping[str, Table], reconstruction: Reconstruction | None
+        self, frame: int, tables: Mapping[str, Columns], reconstruction: Reconstruction | None
     ) -> None:
         """Write the tables of a frame (`frame_tables`) and its surface."""
         self._measures.append(tables["measures"])
@@ -126,7 +126,7 @@ def _put(group: Any, column: Column, values: npt.NDArray[Any], kind: Any = None)
     dataset.attrs["description"] = column.description
 
 
-def _put_table(group: Any, name: str, table: Table) -> None:
+def _put_table(group: Any, name: str, table: Columns) -> None:
     columns = TABLES[name][1:]
     text = h5py.string_dtype("utf-8", TEXT_BYTES)
     kinds = [text if column.digits is None else table[column.name].dtype for column in columns]

@@ -15,7 +15,7 @@ from labapp.core.surface.interpolation import CloughTocherSurface
 from labapp.core.surface.measures import SHAPES, SIZES
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.export.dynamics import Measured, no_time_base
+from labapp.export.dynamics import MeasuredSurface, no_time_base
 
 LARGEST = 1 << 31
 """Largest table, bytes; boundary.csv of 100,000 frames has 1.5 GB, and is read row by row."""
@@ -29,7 +29,7 @@ KEPT_NODES = 800
 WANTED = "as `labapp reconstruct` writes it"
 
 
-def measured_in(folder: Path) -> Iterator[Measured]:
+def measured_in(folder: Path) -> Iterator[MeasuredSurface]:
     """Yield the frames with a surface in a folder that `labapp reconstruct` or an export wrote.
 
     Raises

@@ -30,7 +30,7 @@ PX_DIGITS, MM_DIGITS = 4, 6
 UNITS = ("mm", "mm2", "mm3", "px", "deg", "s")
 NO_UNIT = "1"
 
-Table = dict[str, npt.NDArray[Any]]
+Columns = dict[str, npt.NDArray[Any]]
 """Column name → values, shape (rows,): int64 if always known, float64, or text (object)."""
 
 
@@ -152,7 +152,7 @@ def columns_of(name: str, sigma_parts: bool = False) -> tuple[Column, ...]:
     return tuple(column for column in TABLES[name] if sigma_parts or not column.is_part)
 
 
-def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str, Table]:
+def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str, Columns]:
     """Return all tables of a frame, with the columns of `TABLES`.
 
     Parameters
@@ -167,7 +167,7 @@ def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str
     return _tables_of_places(result, calibration) | {"measures": measures}
 
 
-def _tables_of_places(result: FrameResult, calibration: ImageCalibration) -> dict[str, Table]:
+def _tables_of_places(result: FrameResult, calibration: ImageCalibration) -> dict[str, Columns]:
     """Return the tables of a frame that have a row for each dot or point."""
     measurement = result.measurement
     reconstruction = measurement.reconstruction
@@ -283,7 +283,7 @@ def csv_header(name: str, sigma_parts: bool = False) -> str:
     return csv_text([[column.name for column in columns_of(name, sigma_parts)]])
 
 
-def csv_rows(name: str, table: Table, sigma_parts: bool = False) -> str:
+def csv_rows(name: str, table: Columns, sigma_parts: bool = False) -> str:
     """Return a table's rows as CSV text, without header, rounded to the decimals of `TABLES`."""
     columns = columns_of(name, sigma_parts)
     text = _numeric_rows(columns, table)
@@ -298,7 +298,7 @@ def csv_rows(name: str, table: Table, sigma_parts: bool = False) -> str:
     return csv_text(zip(*cells, strict=True))
 
 
-def _numeric_rows(columns: Sequence[Column], table: Table) -> str | None:
+def _numeric_rows(columns: Sequence[Column], table: Columns) -> str | None:
     """Return the same with compiled loops, for numbers and a constant word in the last column.
 
     None for other tables, and if a number is too close to a tie for correct rounding.

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import time
-from concurrent.futures import CancelledError, ProcessPoolExecutor
+from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 
@@ -15,7 +14,7 @@ from labapp.core.quality import Quality, judge_quality
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.rendering.scene import Scene, scene_of
 from labapp.media.cameras import CameraFrame
-from labapp.simulation.parallel import end_processes, start_worker
+from labapp.simulation.parallel import end_processes, held, hold, worker_pool
 
 JUDGED_S = 0.2
 """Time for which the quality of a frame is reused for the following ones, s."""
@@ -47,11 +46,8 @@ class LiveMeasuring:
     """Measures frames in one process; each call waits for its frame."""
 
     def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
-        spawn = multiprocessing.get_context("spawn")
-        nice, given = 0, (setup, settings, bit_depth)  # normal priority: results are urgent
-        self._pool = ProcessPoolExecutor(
-            1, spawn, initializer=start_worker, initargs=(nice, _begin, *given)
-        )
+        nice = 0  # normal priority: results are urgent
+        self._pool = worker_pool(1, nice, hold, LiveChain, setup, settings, bit_depth)
 
     def measure(self, frame: CameraFrame, drawn: bool = False) -> LiveResult | None:
         """Measure the next frame; None if it is skipped (`SOUGHT_S`).
@@ -122,15 +118,7 @@ class LiveChain:
         return quality
 
 
-_chain: LiveChain | None = None
-"""The chain of this process."""
-
-
-def _begin(setup: Setup, settings: Settings, bit_depth: int) -> None:
-    global _chain  # noqa: PLW0603 - one chain for the life of the process
-    _chain = LiveChain(setup, settings, bit_depth)
-
-
 def _measured(frame: CameraFrame, drawn: bool) -> LiveResult | None:
-    assert _chain is not None
-    return _chain.measure(frame, drawn)
+    """Measure a frame by the chain that this process holds."""
+    found: LiveResult | None = held().measure(frame, drawn)
+    return found

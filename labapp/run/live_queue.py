@@ -51,7 +51,7 @@ class FrameQueue:
         """Frame being measured."""
         self._in_order = self._followed = 0
         """Number of queued frames to be measured in order, and of frames tracked in a row."""
-        self._is_behind = self._is_old = False
+        self._is_behind = self._was_in_order = False
         """Whether the queue overflowed, and whether the frame being measured is one in order."""
         self._catching_up_s = 0.0
         """Measuring time of the frames in order so far."""
@@ -90,9 +90,9 @@ class FrameQueue:
                 self._in_order, self._is_behind = 0, False
                 return None
             assert self._last is not None
-            self._is_old = self._in_order > 0
+            self._was_in_order = self._in_order > 0
             delay_s = self._last.arrived_s - self._waiting[0].arrived_s
-            if self._is_old or not (self._is_behind or delay_s > CATCH_UP_S):
+            if self._was_in_order or not (self._is_behind or delay_s > CATCH_UP_S):
                 self._in_order = max(self._in_order - 1, 0)
                 frame = self._waiting.popleft()
             else:
@@ -108,10 +108,10 @@ class FrameQueue:
     def done(self, followed: bool, took_s: float) -> None:
         """Report whether the frame was tracked, and how long it took, s."""
         with self._turn:
-            self._catching_up_s = self._catching_up_s + took_s if self._is_old else 0.0
+            self._catching_up_s = self._catching_up_s + took_s if self._was_in_order else 0.0
             if not followed:
                 self._followed = 0
-                if self._is_old or self._is_far():
+                if self._was_in_order or self._is_far():
                     # The queued frames cannot be tracked from this one, or are older still.
                     self._waiting.clear()
                     self._every, self._due, self._took_s = self._steps(SWING_S), 0, 0.0

@@ -26,7 +26,7 @@ MOST_KEPT = 12_000
 
 
 @dataclass(frozen=True)
-class Trend(ReadOnlyArrays):
+class LiveSizes(ReadOnlyArrays):
     """Sizes of the last n frames, the oldest first."""
 
     names: tuple[str, ...]
@@ -95,14 +95,14 @@ class LiveTrend:
         failed = sum(not each.is_measured for each in late)
         return Pace((len(late) - failed) / RATE_S, len(late), failed)
 
-    def over(self, last_s: float, limits: Limits) -> Trend:
+    def over(self, last_s: float, limits: Limits) -> LiveSizes:
         """Return the sizes of the last seconds' frames, compared with limits."""
         now_s = time.monotonic()
         with self._turn:
             late = [each for each in self._frames if each.arrived_s > now_s - last_s]
         sizes = np.array([each.sizes_mm for each in late], float).reshape(len(late), 6).T
         value, sigma = sizes[:3], sizes[3:]
-        return Trend(
+        return LiveSizes(
             self._names,
             np.array([each.number for each in late], np.int64),
             np.array([each.arrived_s for each in late], float) - now_s,

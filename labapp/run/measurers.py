@@ -11,7 +11,6 @@ frames measured without tracking (`BY_THEMSELVES`), so that results do not depen
 from __future__ import annotations
 
 import functools
-import multiprocessing
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -20,7 +19,7 @@ from contextlib import AbstractContextManager, ExitStack, closing, contextmanage
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 import numpy as np
@@ -34,7 +33,7 @@ from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.tables import table_rows
 from labapp.media import Frame, GreyImage, open_source
-from labapp.simulation.parallel import NICE, start_worker
+from labapp.simulation.parallel import NICE, Here, held, hold, in_order, worker_pool
 
 if TYPE_CHECKING:
     from labapp.core.recording.chain import WarmChain
@@ -44,11 +43,13 @@ T = TypeVar("T")
 AHEAD = 8
 """Number of frames submitted to a pool of processes beyond the one whose result is awaited."""
 
-VOTERS, WAITS = 3, 5
-"""Frames with a surface that vote on the rows of a frame, itself included, so that there is a
-majority; and the most frames that wait for them."""
+VOTERS = 3
+"""Frames with a surface that vote on the rows of a frame, itself included: there is a majority."""
 
-OPEN_WAITS = 20
+MOST_WAITING = 5
+"""The most frames that wait for them."""
+
+MOST_WAITING_FOR_OPEN = 20
 """The most frames that wait for votes on a frame whose rows are ambiguous."""
 
 FOLLOWED_AT_ONCE = 400
@@ -89,16 +90,16 @@ class ColdMeasurer:
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
-        measured = _results_in_order(map(self._submit, frames), AHEAD)
+        measured = in_order(map(self._submit, frames), AHEAD)
         return _with_rows_voted(measured, self.setup, self.settings)
 
     def _submit(self, number: int) -> Future[FrameResult]:
         """Read a frame in this process, and measure it in the pool, or at once if there is none."""
         frame = _read(self.read, number, self.setup, self.settings)
         if isinstance(frame, FrameResult):
-            return _finished(lambda: frame)
-        submit = _finished if self.pool is None else self.pool.submit
-        return submit(_cold, number, frame, self.setup, self.settings, self.corrected(number))
+            return Here().submit(lambda: frame)
+        pool = self.pool or Here()
+        return pool.submit(_cold, number, frame, self.setup, self.settings, self.corrected(number))
 
 
 def _with_rows_voted(
@@ -106,7 +107,8 @@ def _with_rows_voted(
 ) -> Generator[FrameResult]:
     """Yield results in order, with rows decided by a vote among neighbouring frames (`RowVote`).
 
-    A frame is judged as soon as `VOTERS` frames with a surface are known, or after `WAITS` frames.
+    A frame is judged as soon as `VOTERS` frames with a surface are known, or after
+    `MOST_WAITING` frames.
 
     Parameters
     ----------
@@ -124,7 +126,8 @@ def _with_rows_voted(
         first, voters = waiting[0][1], sum(ballot.at is not None for _, ballot in waiting)
         if first.at is None and not first.is_open:
             return True
-        return voters >= VOTERS or len(waiting) > (OPEN_WAITS if first.is_open else WAITS)
+        most = MOST_WAITING_FOR_OPEN if first.is_open else MOST_WAITING
+        return voters >= VOTERS or len(waiting) > most
 
     def judged() -> FrameResult:
         result, ballot = waiting.popleft()
@@ -144,13 +147,6 @@ def _with_rows_voted(
             raise
         while waiting:
             yield judged()
-
-
-def _finished(work: Callable[..., T], *given: Any) -> Future[T]:
-    """Call a function at once, with the interface of a pool."""
-    future: Future[T] = Future()
-    future.set_result(work(*given))
-    return future
 
 
 def _read(read: Read, number: int, setup: Setup, settings: Settings) -> Frame | FrameResult:
@@ -194,26 +190,7 @@ def _threads() -> ThreadpoolController:
 
 def measuring_pool(workers: int) -> ProcessPoolExecutor:
     """Return a pool of measuring processes, which have low priority."""
-    spawn = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, spawn, initializer=start_worker, initargs=(NICE,))
-
-
-def _results_in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
-    """Yield results in order, with ``ahead`` futures begun, which are cancelled when closed."""
-    waiting: deque[Future[T]] = deque()
-    try:
-        for future in begun:
-            waiting.append(future)
-            while waiting and (len(waiting) > ahead or waiting[0].done()):
-                result = waiting[0].result()
-                waiting.popleft()
-                yield result
-        while waiting:
-            yield waiting[0].result()
-            waiting.popleft()
-    finally:
-        for future in waiting:
-            future.cancel()
+    return worker_pool(workers, NICE)
 
 
 # --- one line, over all frames ------------------------------------------------------------------
@@ -340,7 +317,7 @@ class _ChainElsewhere:
     def __init__(self, pool: Executor, setup: Setup, settings: Settings) -> None:
         self.track_lost: str | None = None
         self._pool = pool
-        pool.submit(_begin_chain, setup, settings)
+        pool.submit(hold, _new_chain, setup, settings)
 
     def skip(self) -> None:
         """Skip a frame."""
@@ -352,28 +329,22 @@ class _ChainElsewhere:
         return found
 
 
-_worker_chain: WarmChain | None = None
-"""The chain of this process, for `_ChainElsewhere`."""
-
-
-def _begin_chain(setup: Setup, settings: Settings) -> None:
-    global _worker_chain  # noqa: PLW0603 - one chain at a time
+def _new_chain(setup: Setup, settings: Settings) -> WarmChain:
     from labapp.core.recording.chain import WarmChain
 
     cv2.setNumThreads(1)
-    _worker_chain = WarmChain(setup.bench, settings)
+    return WarmChain(setup.bench, settings)
 
 
 def _skip_in_chain() -> None:
-    assert _worker_chain is not None
-    _worker_chain.skip()
+    held().skip()
 
 
 def _measure_in_chain(image: GreyImage) -> tuple[Measurement, str | None]:
-    assert _worker_chain is not None
+    warm: WarmChain = held()
     with _one_thread():
-        found = _worker_chain.measure(image)
-    return found, _worker_chain.track_lost
+        found = warm.measure(image)
+    return found, warm.track_lost
 
 
 @dataclass(frozen=True)
@@ -431,27 +402,22 @@ class RecordingMeasurer:
                     yield pool.submit(_next_batch)
 
         batches = -(-STRETCH // BATCH)
-        for batch in _results_in_order(begun(), len(self.pools) * batches):
+        for batch in in_order(begun(), len(self.pools) * batches):
             yield from batch
-
-
-_running_stretch: Generator[FrameResult] | None = None
-"""The stretch of this process."""
 
 
 def _first_batch(measurer: RecordingMeasurer, frames: Sequence[int]) -> list[FrameResult]:
     """Begin a stretch in this process, and end the previous one."""
-    global _running_stretch  # noqa: PLW0603 - one stretch at a time
-    if _running_stretch is not None:
-        _running_stretch.close()
+    if (previous := held()) is not None:
+        previous.close()
     cv2.setNumThreads(1)
-    _running_stretch = measurer(frames)
+    hold(measurer, frames)
     return _next_batch()
 
 
 def _next_batch() -> list[FrameResult]:
-    assert _running_stretch is not None
-    return list(islice(_running_stretch, BATCH))
+    """Return the next results of the stretch that this process holds."""
+    return list(islice(held(), BATCH))
 
 
 @contextmanager

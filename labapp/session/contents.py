@@ -14,7 +14,7 @@ import numpy as np
 from labapp.errors import InputError, require, unknown_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
     from labapp.config.setup import Setup
     from labapp.core.lines.correction import LineCorrection
@@ -46,7 +46,7 @@ class SessionContents:
         from labapp.session.calibration_pictures import CalibrationPictures
         from labapp.session.documents import Documents
         from labapp.session.frames import Frames
-        from labapp.session.results.measured import Results
+        from labapp.session.results.measured import StoredResults
         from labapp.session.results.overviews import Overviews
 
         self.path = database.path
@@ -56,7 +56,7 @@ class SessionContents:
         self._database = database
         self._frames = Frames(database)
         self._pictures = CalibrationPictures(database)
-        self._results = Results(database)
+        self._results = StoredResults(database)
         self._documents = Documents(database, self._results.restore)
         self._overviews = Overviews(database, self._results)
 
@@ -270,19 +270,30 @@ class SessionContents:
             self._documents.fingerprint("correction", frame),
         )
 
-    def frame_results(self, stale: bool = True) -> Iterator[FrameResult]:
+    def frame_results(
+        self,
+        stale: bool = True,
+        *,
+        scheme: str | None = None,
+        frames: Collection[int] | None = None,
+    ) -> Iterator[FrameResult]:
         """Results of the frames that were measured, read one by one.
 
         Parameters
         ----------
         stale
             Whether to include results that are out of date.
+        scheme
+            ``fit``, ``ers``, ``irs-opa`` …; None: the scheme of the settings.
+        frames
+            Numbers of the frames; None: all.
         """
         from labapp.export.frame_result import FrameResult
 
-        times = self.overview().time_s.tolist()
+        chosen = frozenset(self.frames.tolist() if frames is None else frames)
+        times = self.overview(scheme).time_s.tolist()
         for frame, time_s in zip(self.frames.tolist(), times, strict=True):
-            found = self.result(frame)
+            found = self.result(frame, scheme) if frame in chosen else None
             if found is not None and (stale or not found.stale):
                 time = None if np.isnan(time_s) else time_s
                 yield FrameResult(frame, time, found.measurement)

@@ -14,6 +14,7 @@ from urllib.parse import quote
 
 from labapp.errors import InputError, os_errors_as_input
 from labapp.files import atomic_file
+from labapp.session.creation import new_session
 from labapp.session.documents import Key, Kind
 from labapp.session.file.database import SUFFIX, new_session_path
 from labapp.session.file.schema import NO_FRAME
@@ -116,14 +117,9 @@ def next_session(session: Session, path: str | os.PathLike[str]) -> Session:
     }
     if copied["record", NO_FRAME] is not None:
         copied["record", NO_FRAME] = replace(session.record, safety=())
-    new = Session.create(path)
-    try:
+    with new_session(path) as new:
         new._pictures.copy_from(session._pictures)
         new._documents.change(f"as in {session.path.stem}", copied)
-    except BaseException:
-        new.close()
-        new.path.unlink()
-        raise
     return new
 
 

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from labapp.core.values import IntArray
 from labapp.errors import PATH, InputError, check_positive, require
 from labapp.export.summary import format_ranges
+from labapp.files import relative_path
 from labapp.media import Frame, FrameSource, GreyImage, open_source
 from labapp.media.formats.images import decoded
 from labapp.media.identity import identify
@@ -107,7 +108,7 @@ class Frames:
             found = survey(source, progress)
             size, sha256 = identify(path)
             recording = Recording(
-                path=self._relative(path),
+                path=relative_path(path, self._database.path.parent),
                 size=size,
                 sha256=sha256,
                 description=source.description,
@@ -274,7 +275,7 @@ class Frames:
                 f"another recording ({found[0]} bytes)",
                 f"{Path(recording.path).name} as it was imported ({recording.size} bytes)",
             )
-        moved = replace(recording, path=self._relative(path))
+        moved = replace(recording, path=relative_path(path, self._database.path.parent))
         with self._database.transaction() as connection:
             connection.execute("UPDATE recording SET content = ?", (pack(moved),))
         self.close()
@@ -363,12 +364,6 @@ class Frames:
         place = Path(os.path.normpath(folder / recording.path))
         beside = folder / Path(recording.path).name
         return beside if not place.exists() and beside.exists() else place
-
-    def _relative(self, path: Path) -> str:
-        try:
-            return Path(os.path.relpath(path, self._database.path.parent)).as_posix()
-        except ValueError:  # another drive
-            return path.as_posix()
 
     def _which(self) -> str:
         numbers = self.numbers

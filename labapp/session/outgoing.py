@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -143,12 +142,7 @@ class _Measured:
         self._session, self._scheme, self._numbers = session, scheme, numbers
 
     def __iter__(self) -> Iterator[FrameResult]:
-        seen = self._session.overview(self._scheme)
-        times_s = dict(zip(seen.frame.tolist(), seen.time_s.tolist(), strict=True))
-        for number in self._numbers:
-            measurement = _result(self._session, number, self._scheme).measurement
-            time_s = times_s[number]
-            yield FrameResult(number, time_s if math.isfinite(time_s) else None, measurement)
+        return self._session.frame_results(scheme=self._scheme, frames=self._numbers)
 
 
 def _current_frames(

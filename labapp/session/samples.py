@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
 from labapp.bundled import SAMPLE_TEXTS, bundled
 from labapp.errors import InputError
+from labapp.session.creation import new_session
 from labapp.session.record import Record
 from labapp.session.session import Session
 
@@ -102,13 +102,9 @@ def begin_session(name: str, path: Path) -> Session:
         incomplete session is deleted.
     """
     sample, folder = SAMPLES[name], sample_folder(name)
-    with contextlib.ExitStack() as on_failure:
-        session = Session.create(path, sample.record)
-        on_failure.callback(path.unlink)
-        on_failure.callback(session.close)
+    with new_session(path, sample.record) as session:
         session.set_setup((folder / "setup.toml").read_text("utf-8"))
         if (folder / "calibration.png").exists():
             session.calibrate_plane(folder / "calibration.png", UNIT_MM)
         session.import_recording(folder / sample.recording, frame_rate_hz=sample.frame_rate_hz)
-        on_failure.pop_all()
     return session

@@ -5,7 +5,6 @@ The recording can also be made into a session.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import tempfile
@@ -15,8 +14,8 @@ from pathlib import Path
 from labapp.config.scenario import Scenario
 from labapp.config.scenario_keys import RECORDINGS
 from labapp.errors import InputError, os_errors_as_input
+from labapp.session.creation import new_session
 from labapp.session.record import Record
-from labapp.session.session import Session
 from labapp.simulation.parallel import Progress
 
 SCENARIO = "scenario.toml"
@@ -109,11 +108,7 @@ def begin_session(
         notes=f"Simulated, seed {made.seed}; the ground truth is in {folder.name}.",
     )
     rate_hz = None if made.file.endswith(".avi") else made.frame_rate_hz
-    with contextlib.ExitStack() as on_failure:
-        session = Session.create(path, record)
-        on_failure.callback(path.unlink)
-        on_failure.callback(session.close)
+    with new_session(path, record) as session:
         session.set_setup(scenario.setup)
         session.import_recording(folder / made.file, frame_rate_hz=rate_hz, progress=progress)
-        on_failure.pop_all()
     session.close()

@@ -7,11 +7,12 @@ import functools
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, wait
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -107,14 +108,52 @@ def wait_for(future: Future[R], poll: Callable[[], None]) -> R:
     return future.result()
 
 
+def in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
+    """Yield results in order, with ``ahead`` futures begun, which are cancelled when closed."""
+    waiting: deque[Future[T]] = deque()
+    try:
+        for future in begun:
+            waiting.append(future)
+            while waiting and (len(waiting) > ahead or waiting[0].done()):
+                result = waiting[0].result()
+                waiting.popleft()
+                yield result
+        while waiting:
+            yield waiting[0].result()
+            waiting.popleft()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+class Here(Executor):
+    """Runs each task immediately, in this process."""
+
+    def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
+        """Call a function at once; the future has its result or its exception."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(work(*given, **named))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def worker_pool(
+    workers: int, nice: int = 0, become: Callable[..., None] | None = None, *given: object
+) -> ProcessPoolExecutor:
+    """Return a pool of worker processes, each begun by `start_worker`."""
+    spawn = multiprocessing.get_context("spawn")
+    begin = functools.partial(start_worker, nice, become, *given)
+    return ProcessPoolExecutor(workers, spawn, initializer=begin)
+
+
 @contextmanager
 def processes(
     workers: int, become: Callable[..., None] | None = None, *given: object
 ) -> Iterator[ProcessPoolExecutor]:
     """Pool of worker processes that call ``become(*given)`` first; an exception ends them."""
-    spawn = multiprocessing.get_context("spawn")
-    begin = functools.partial(start_worker, NICE if _low.get() else 0, become, *given)
-    pool = ProcessPoolExecutor(workers, spawn, initializer=begin)
+    pool = worker_pool(workers, NICE if _low.get() else 0, become, *given)
     try:
         yield pool
     except BaseException:
@@ -136,7 +175,7 @@ def end_processes(pool: ProcessPoolExecutor, wait: bool = True) -> None:
 
 
 def start_worker(nice: int = 0, become: Callable[..., None] | None = None, *given: object) -> None:
-    """Initialise a worker process; see `processes`.
+    """Initialise a worker process: it calls ``become(*given)``, if any, such as `hold`.
 
     The niceness is raised by ``nice``, the process computes in one thread, and it ends when its
     parent ends, even if that is killed. There is no clean-up when it ends: functions registered
@@ -157,6 +196,21 @@ def start_worker(nice: int = 0, become: Callable[..., None] | None = None, *give
     atexit.register(os._exit, 0)  # unloading the libraries would take half a second
     if become is not None:
         become(*given)
+
+
+_held: Any = None
+"""The object that this process holds."""
+
+
+def hold(make: Callable[..., Any], *given: object) -> None:
+    """Make the object that this worker process holds for later calls (`held`); one at a time."""
+    global _held  # noqa: PLW0603 - processes share nothing, so that each has its own
+    _held = make(*given)
+
+
+def held() -> Any:
+    """Return the object that this process holds; None if there is none."""
+    return _held
 
 
 @contextmanager

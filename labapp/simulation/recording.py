@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import ClassVar, Protocol
@@ -22,7 +23,7 @@ from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 from labapp.simulation.calibration.target import Target, TargetLook, render_target
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, Reflections, trace
-from labapp.simulation.parallel import Progress, processes, wait_for
+from labapp.simulation.parallel import Progress, held, hold, processes, wait_for
 from labapp.simulation.render import GreyImage, Look, Picture, ray_brightness, render
 from labapp.simulation.torch import Torch
 from labapp.system import interrupts_blocked
@@ -181,13 +182,13 @@ class Recording:
         if workers == 1:
             yield from (_render(self, number) for number in numbers)
             return
-        with processes(workers, _become_worker, self) as pool:
+        with processes(workers, hold, partial, _render, self) as pool:
             waiting: deque[Future[_Rendered]] = deque()
             with interrupts_blocked():
-                waiting += (pool.submit(_work, n) for n in islice(numbers, workers + AHEAD))
+                waiting += (pool.submit(_render_there, n) for n in islice(numbers, workers + AHEAD))
             while waiting:
                 yield wait_for(waiting.popleft(), poll)
-                waiting += (pool.submit(_work, n) for n in islice(numbers, 1))
+                waiting += (pool.submit(_render_there, n) for n in islice(numbers, 1))
 
     def _write_recording(self, path: Path, images: Iterator[Picture]) -> None:
         if path.suffix == ".tif":
@@ -236,17 +237,10 @@ def _render(recording: Recording, number: int) -> _Rendered:
     return _Rendered(frame.image, truth, list(_dot_rows(number, frame)))
 
 
-_recording: Recording
-"""The recording that this worker process renders."""
-
-
-def _become_worker(recording: Recording) -> None:
-    global _recording  # noqa: PLW0603 - set once, where the process begins
-    _recording = recording
-
-
-def _work(number: int) -> _Rendered:
-    return _render(_recording, number)
+def _render_there(number: int) -> _Rendered:
+    """Render a frame of the recording that this process holds."""
+    rendered: _Rendered = held()(number)
+    return rendered
 
 
 # --- files --------------------------------------------------------------------------------------

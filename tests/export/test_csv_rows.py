@@ -18,7 +18,7 @@ from labapp.export.fixed_point import format_fixed
 from labapp.export.frame_result import FrameResult
 from labapp.export.tables import (
     TABLES,
-    Table,
+    Columns,
     csv_header,
     csv_rows,
     frame_tables,
@@ -33,7 +33,7 @@ NUMBERS = st.one_of(
 )
 
 
-def rows_by_cell(name: str, table: Table) -> str:
+def rows_by_cell(name: str, table: Columns) -> str:
     columns = TABLES[name]
     cells = [
         [x if c.digits is None else number(x, c.digits) for x in table[c.name].tolist()]
@@ -60,7 +60,7 @@ def test_numbers_are_formatted_as_by_python(rows: list[tuple[float, ...]]) -> No
 @pytest.mark.parametrize("sources", [["auto"] * 3, ["auto", "manual", "auto"], []])
 def test_tables_with_text_are_formatted_equally(sources: list[str]) -> None:
     rng = np.random.default_rng(2)
-    table: Table = {
+    table: Columns = {
         column.name: rng.integers(0, 20, len(sources)).astype(float)
         if column.digits == 0
         else rng.normal(0.0, 90.0, len(sources))
@@ -74,7 +74,7 @@ def test_tables_with_text_are_formatted_equally(sources: list[str]) -> None:
 def test_number_of_many_digits_is_formatted_by_python() -> None:
     assert format_fixed(np.array([[1e12]]), np.array([6]))[1] == -1
     values = np.array([2e-7, 3e12, 1.5])
-    table: Table = {column.name: values for column in TABLES["boundary"]}
+    table: Columns = {column.name: values for column in TABLES["boundary"]}
     assert csv_rows("boundary", table) == rows_by_cell("boundary", table)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from labapp.session.file.schema import MEASURES
 from labapp.session.results.measured import Overview
-from labapp.session.results.trends import FEWEST, doubtful_frames, spectrum, spread, trend
+from labapp.session.results.trends import FEWEST, outlying_frames, spectrum, statistics_of, trend
 
 RATE_HZ = 60.0
 
@@ -34,7 +34,7 @@ def noisy(count: int = 40) -> np.ndarray:
 
 def test_spread_is_defined_as_in_eq_7_4() -> None:
     """Eq. 7-4 divides by n: 15 heights, here 1 … 15."""
-    result = spread(trend(overview(np.arange(1.0, 16.0)), "height_mm"))
+    result = statistics_of(trend(overview(np.arange(1.0, 16.0)), "height_mm"))
     assert (result.count, result.mean, result.lowest, result.highest) == (15, 8.0, 1.0, 15.0)
     assert result.deviation == pytest.approx(np.sqrt(224 / 12))
 
@@ -46,8 +46,8 @@ def test_spread_excludes_stale_frames_and_those_without_a_surface() -> None:
     measured = replace(measured, stale=np.arange(40) < 10)
     course = trend(measured, "height_mm")
     assert course.frame.tolist() == [k for k in range(40) if k not in (3, 7)]
-    assert spread(course).mean == pytest.approx(height[10:].mean())
-    assert spread(trend(replace(measured, stale=np.ones(40, bool)), "height_mm")).count == 0
+    assert statistics_of(course).mean == pytest.approx(height[10:].mean())
+    assert statistics_of(trend(replace(measured, stale=np.ones(40, bool)), "height_mm")).count == 0
 
 
 def test_trend_has_sigma_corrections_and_time_axis() -> None:
@@ -67,22 +67,22 @@ def test_trend_has_sigma_corrections_and_time_axis() -> None:
 def test_outlying_frame_is_doubtful(odd: int) -> None:
     height = noisy()
     height[odd] *= 1.16  # a row shifted by one
-    assert np.flatnonzero(doubtful_frames(overview(height))).tolist() == [odd]
-    course = trend(overview(height), "height_mm", without_doubtful=True)
-    assert spread(course).count == 39
-    assert spread(trend(overview(height), "height_mm")).count == 40
+    assert np.flatnonzero(outlying_frames(overview(height))).tolist() == [odd]
+    course = trend(overview(height), "height_mm", without_outlying=True)
+    assert statistics_of(course).count == 39
+    assert statistics_of(trend(overview(height), "height_mm")).count == 40
     are = np.full(40, 0.02)
     are[odd] = 0.1  # a wrong column
-    assert np.flatnonzero(doubtful_frames(overview(noisy(), are_mm=are))).tolist() == [odd]
+    assert np.flatnonzero(outlying_frames(overview(noisy(), are_mm=are))).tolist() == [odd]
 
 
 def test_growing_oscillating_or_noisy_pool_is_not_doubtful() -> None:
     growing = noisy(200) + np.linspace(0, 0.3, 200)
-    assert not doubtful_frames(overview(growing)).any()
-    assert not doubtful_frames(overview(noisy(2000))).any()
+    assert not outlying_frames(overview(growing)).any()
+    assert not outlying_frames(overview(noisy(2000))).any()
     oscillating = 0.3 + 0.02 * np.sin(np.arange(200))
-    assert not doubtful_frames(overview(oscillating)).any()
-    assert not doubtful_frames(overview(noisy(FEWEST - 1) * np.array([9, *[1] * 6]))).any()
+    assert not outlying_frames(overview(oscillating)).any()
+    assert not outlying_frames(overview(noisy(FEWEST - 1) * np.array([9, *[1] * 6]))).any()
 
 
 def test_spectrum_gives_frequency_and_amplitude_of_an_oscillation() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -99,20 +99,11 @@ def _facts(session: Session) -> dict[str, Any]:
     }
 
 
-def _differences(value: Any, usual: Any, within: str = "") -> dict[str, Any]:
+def _differences(value: Any, usual: Any) -> dict[str, Any]:
     """Return the fields that differ from ``usual``, full name → value."""
-    found: dict[str, Any] = {}
-    for field in fields(value):
-        name, mine, other = (
-            within + field.name,
-            getattr(value, field.name),
-            getattr(usual, field.name),
-        )
-        if is_dataclass(mine) and type(mine) is type(other):
-            found |= _differences(mine, other, f"{name}.")
-        elif mine != other:
-            found[name] = mine
-    return found
+    from labapp.config.settings import differences
+
+    return {name: mine for name, (mine, _) in differences(value, usual).items()}
 
 
 def _text(facts: dict[str, Any]) -> list[str]:

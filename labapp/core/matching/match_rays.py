@@ -96,34 +96,28 @@ def match_rays(
 ) -> tuple[Match, SplineSurface]:
     """Find the ray of every dot that has an unambiguous one, and the surface that explains them.
 
-        Parameters
-        ----------
-        dots, lattice
-            Dots of the frame, and their rows and columns; None if no lattice could be grown.
-        bench
-            The bench.
-        frame_shape
-            Height and width of the frame, px.
-        settings
-            See `MatchSettings`.
+    Parameters
+    ----------
+    dots, lattice
+        Dots of the frame, and their rows and columns; None if no lattice could be grown.
+    bench
+        The bench.
+    frame_shape
+        Height and width of the frame, px.
+    settings
+        See `MatchSettings`.
 
-        Raises
-        ------
-        CannotMeasure
-    <<<<<<< HEAD:labapp/core/matching/match_rays.py
-            ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``no-reference`` if the pattern has
-            no absent ray or no hole can be the absent dot; ``ambiguous-rows`` if a dot lies in the only
-            hole, or a part of the rows can be shifted; ``ambiguous-orientation``; ``no-match`` if no
-            surface explains the dots.
-    =======
-            ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``too-many-dots`` if most could
-            have no ray even if every ray made one; ``no-reference`` if the pattern has no absent ray or
-            no hole can be the absent dot, ``ambiguous-rows`` if several can; ``ambiguous-orientation``;
-            ``no-match`` if no surface explains the dots.
-    >>>>>>> w1:labapp/core/matching/correspondence.py
-        RowsOpen
-            ``ambiguous-rows`` if several holes can be the absent dot, perhaps with a set-up that is
-            wrong within its uncertainty. Other frames of the recording may decide between them.
+    Raises
+    ------
+    CannotMeasure
+        ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``too-many-dots`` if most could
+    have no ray even if every ray made one; ``no-reference`` if the pattern has no absent ray or
+    no hole can be the absent dot; ``ambiguous-rows`` if a dot lies in the only hole, or a part
+    of the rows can be shifted; ``ambiguous-orientation``; ``no-match`` if no surface explains
+    the dots.
+    RowsOpen
+        ``ambiguous-rows`` if several holes can be the absent dot, perhaps with a set-up that is
+        wrong within its uncertainty. Other frames of the recording may decide between them.
     """
     if len(dots) < LEAST_LABELS:
         raise CannotMeasure(

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import textwrap
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -27,6 +25,7 @@ from labapp.export.frame_result import FrameResult
 from labapp.export.rendering.scene import Scene, empty_scene, scene_of
 from labapp.export.rendering.studio import Picture, draw_there
 from labapp.files import atomic_file
+from labapp.simulation.parallel import in_order
 
 CODEC = "mpeg4"
 QUALITY = 2
@@ -116,10 +115,10 @@ def write_film(
     OSError
         If it cannot be written.
     """
-    scenes = (film_scene(each, extent) for each in measured)
+    begun = (process.submit(draw_there, film_scene(each, extent)) for each in measured)
 
     def counted() -> Iterator[Picture]:
-        for done, picture in enumerate(_drawn(scenes, process), 1):
+        for done, picture in enumerate(in_order(begun, AHEAD), 1):
             yield picture
             progress(done)
 
@@ -216,19 +215,3 @@ def _encode(container: OutputContainer, pictures: Iterable[Picture], ticks: IntA
         for packet in stream.encode(frame):  # the encoder does not buffer frames
             packet.duration = int(end - begin)
             container.mux(packet)
-
-
-def _drawn(scenes: Iterable[Scene], process: Executor) -> Iterator[Picture]:
-    """Yield pictures of scenes, in order, a few drawn ahead."""
-    waiting: deque[Future[Picture]] = deque()
-    rest = iter(scenes)
-    try:
-        while True:
-            ahead = itertools.islice(rest, 1 + AHEAD - len(waiting))
-            waiting.extend(process.submit(draw_there, scene) for scene in ahead)
-            if not waiting:
-                return
-            yield waiting.popleft().result()
-    finally:
-        for future in waiting:
-            future.cancel()

@@ -19,7 +19,7 @@ from labapp.gui.widgets.layouts import scrolled, vbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 from labapp.run.limits import LARGEST_MM, NAMES, Ends, Limits
-from labapp.run.live_trend import TREND_S, Trend
+from labapp.run.live_trend import TREND_S, LiveSizes
 from labapp.run.live_watch import LiveWatch
 from labapp.text import SIGMA_OF
 
@@ -47,7 +47,7 @@ RULE = (
 )
 
 
-def trend_curves(trend: Trend, limits: Limits, names: tuple[str, ...]) -> tuple[Curve, ...]:
+def trend_curves(trend: LiveSizes, limits: Limits, names: tuple[str, ...]) -> tuple[Curve, ...]:
     """Width, length and height against the time from now, with their limits."""
     # A frame without values inside a gap keeps a line from crossing it.
     gap = np.flatnonzero(np.diff(trend.since_s) > GAP_S) + 1

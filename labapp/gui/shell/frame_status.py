@@ -45,7 +45,7 @@ TO_CHECK = (FrameStatus.DOUBTFUL, FrameStatus.NOT_MEASURABLE)
 
 def frame_statuses(seen: Overview) -> IntArray:
     """State of every frame, values of `FrameStatus`, shape (n,)."""
-    from labapp.session.results.trends import doubtful_frames
+    from labapp.session.results.trends import outlying_frames
 
     status = np.array(seen.status, dtype=object)
     done = status != ""
@@ -55,7 +55,7 @@ def frame_statuses(seen: Overview) -> IntArray:
     found = np.where(seen.corrected & (measured | ~done), FrameStatus.CORRECTED, found)
     found = np.where(failed, FrameStatus.NOT_MEASURABLE, found)
     found = np.where(status == PULSE, FrameStatus.PULSE, found)
-    doubtful = (done & seen.stale) | (measured & doubtful_frames(seen))
+    doubtful = (done & seen.stale) | (measured & outlying_frames(seen))
     return np.asarray(np.where(doubtful, FrameStatus.DOUBTFUL, found), np.int64)
 
 

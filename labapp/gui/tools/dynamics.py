@@ -22,7 +22,7 @@ from labapp.gui.widgets.tables import CellTable
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics
-    from labapp.export.dynamics import Measured
+    from labapp.export.dynamics import MeasuredSurface
     from labapp.gui.shell.files import Files
     from labapp.session.results.measured import Overview
 
@@ -150,7 +150,7 @@ class DynamicsWindow(ToolWindow):
         settings = DynamicsSettings(self.of.value(), band, self.segment.value())
         signals = session.signals.timed() if session.signals else {}
 
-        def counted(control: Control) -> Iterator[Measured]:
+        def counted(control: Control) -> Iterator[MeasuredSurface]:
             from labapp.export.dynamics import measured_of
 
             for done, one in enumerate(measured_of(session.frame_results(stale=False))):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -14,9 +13,9 @@ from labapp.gui.digits import with_sigma
 from labapp.run.study.plan import StudyPlan, StudyRecording, matching_recordings, shown_condition
 from labapp.run.study.status import STATE_WORDS, RecordingStatus, State
 from labapp.run.study.summary import StudySummary
+from labapp.session.creation import new_session
 from labapp.session.file.database import SUFFIX
 from labapp.session.record import Record
-from labapp.session.session import Session
 from labapp.simulation.parallel import Progress
 from labapp.studies.tables import Table
 from labapp.text import axis_label, column_heading, pluralize
@@ -126,10 +125,7 @@ def begin_session(folder: Path, recording: StudyRecording, progress: Progress) -
         return path
     text = read_setup(recording.setup, lines=True).text
     path.parent.mkdir(parents=True, exist_ok=True)
-    with contextlib.ExitStack() as on_failure:
-        session = Session.create(path, _record(recording))
-        on_failure.callback(path.unlink)
-        on_failure.callback(session.close)
+    with new_session(path, _record(recording)) as session:
         session.set_setup(text)
         session.set_settings(recording.settings)
         session.import_recording(
@@ -137,7 +133,6 @@ def begin_session(folder: Path, recording: StudyRecording, progress: Progress) -
             recording.frames,
             progress=lambda done, total: progress("importing", done, total),
         )
-        on_failure.pop_all()
     with session:
         total = len(session.frames)
         for done, _ in enumerate(session.measure_each(warm=recording.warm), 1):

@@ -38,7 +38,7 @@ from labapp.core.pipeline import Settings
 from labapp.core.schemes import SCHEMES
 from labapp.errors import InputError, os_errors_as_input
 from labapp.export.tables import TABLES
-from labapp.files import as_bytes, write_file
+from labapp.files import as_bytes, relative_path, write_file
 from labapp.media import RECORDING_SUFFIXES
 from labapp.text import split_unit, unescaped_csv_text
 
@@ -239,8 +239,8 @@ def write_study(
     read_setup(setup)  # otherwise each recording would fail by it
     folder = path.parent.absolute()
     found = [each for text in recordings for each in matching_recordings(text)]
-    bench = _relative(Path(setup), folder)
-    files = [(_relative(file, folder), varied) for file, varied in found]
+    bench = relative_path(Path(setup), folder)
+    files = [(relative_path(file, folder), varied) for file, varied in found]
     entries = [
         (f"recording[{k}]", {"file": file, "setup": bench, "conditions": varied})
         for k, (file, varied) in enumerate(files, 1)
@@ -290,14 +290,6 @@ def folder_pattern(folder: Path) -> Path:
             if names:
                 return folder / names.most_common(1)[0][0]
     raise InputError(folder, "folder", "no recording in it", "a folder with recordings")
-
-
-def _relative(path: Path, folder: Path) -> str:
-    """Return a path relative to a folder, with ``/``; absolute if there is no relative path."""
-    try:
-        return Path(os.path.relpath(path, folder)).as_posix()
-    except ValueError:  # on another drive
-        return path.absolute().as_posix()
 
 
 def _toml(value: Condition) -> str:

@@ -34,7 +34,7 @@ from labapp.core.recording.residual_check import (
 from labapp.core.surface.measures import SIZES, sigma_name
 from labapp.errors import os_errors_as_input
 from labapp.export.meshes import SPACING_MM
-from labapp.export.tables import MM_DIGITS, Table, number
+from labapp.export.tables import MM_DIGITS, Columns, number
 from labapp.files import as_bytes, atomic_file, write_file
 from labapp.run.study.page import summary_page
 from labapp.run.study.plan import COLUMNS, Condition, StudyPlan
@@ -119,12 +119,12 @@ def _counted(status: RecordingStatus, frames: int) -> RecordingStatus:
     return replace(status, state="part" if frames else "waiting", frames_done=frames)
 
 
-def assembled(tasks: Tasks) -> tuple[Table | None, SetupVerdict | None]:
+def assembled(tasks: Tasks) -> tuple[Columns | None, SetupVerdict | None]:
     """Return all measured rows of a recording, and their verdict on the set-up.
 
     A damaged file is deleted, so that its stretch is measured again.
     """
-    tables: list[Table] = []
+    tables: list[Columns] = []
     record = ResidualRecord(tasks.setup.rig)
     scheme = tasks.recording.settings.scheme
     for stretch in tasks.stretches:
@@ -151,7 +151,7 @@ def assembled(tasks: Tasks) -> tuple[Table | None, SetupVerdict | None]:
 
 
 def _summarised(
-    status: RecordingStatus, tasks: Tasks, table: Table, verdict: SetupVerdict | None
+    status: RecordingStatus, tasks: Tasks, table: Columns, verdict: SetupVerdict | None
 ) -> RecordingSummary:
     is_doubtful = verdict is not None and verdict.is_doubtful
     return RecordingSummary(
@@ -168,7 +168,7 @@ def _summarised(
 
 def _write_parquet(
     path: Path,
-    table: Table,
+    table: Columns,
     conditions: Sequence[str],
     numbers: Sequence[str],
     status: RecordingStatus,
@@ -210,7 +210,7 @@ def _field(name: str, kind: Any, unit: str, description: str) -> Any:
 # --- surfaces -----------------------------------------------------------------------------------
 
 
-def _write_surfaces(folder: Path, status: RecordingStatus, tasks: Tasks, table: Table) -> None:
+def _write_surfaces(folder: Path, status: RecordingStatus, tasks: Tasks, table: Columns) -> None:
     """Write the surfaces of a recording as one array, stretch by stretch; complete or absent."""
     import zarr
 

@@ -14,7 +14,7 @@ from labapp.core.surface.measures import WITH_SIGMA, sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.features import FeatureTable, weld_series
-from labapp.export.tables import Table
+from labapp.export.tables import Columns
 from labapp.run.study.plan import RESERVED, StudyPlan
 
 LARGEST_FILE = 64_000_000
@@ -32,7 +32,7 @@ NEAR_S = 0.1
 
 
 def study_features(
-    plan: StudyPlan, tables: Mapping[str, Table], sections: Path | None
+    plan: StudyPlan, tables: Mapping[str, Columns], sections: Path | None
 ) -> tuple[FeatureTable, int]:
     """Return features of the recordings with sections, and the number of unassigned sections.
 
@@ -71,7 +71,7 @@ def study_features(
     return FeatureTable(WITH_SIGMA, target, tuple(found)), unused
 
 
-def _series(name: str, table: Table) -> WeldSeries:
+def _series(name: str, table: Columns) -> WeldSeries:
     there = (table["status"] == "ok") & np.isfinite(table["time_s"])
     columns = {key: of[there] for key, of in table.items() if of.dtype.kind in "fi"}
     return weld_series(name, columns["time_s"], columns, WITH_SIGMA)

@@ -32,7 +32,7 @@ from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.meshes import SPACING_MM, refuse_too_large
-from labapp.export.tables import Table, frame_tables
+from labapp.export.tables import Columns, frame_tables
 from labapp.files import as_bytes, write_atomically
 from labapp.media import open_source
 from labapp.media.identity import identify, stamp
@@ -102,19 +102,19 @@ def look_at_recording(recording: Path, folder: Path) -> None:
     with open_source(recording) as source:
         source.frame(0)
         size, sha256 = identify(recording)
-        index = None if source.index is None else base64.b64encode(zlib.compress(source.index))
-        found = {
-            "format": FORMAT,
-            "stamp": before,
-            "size": size,
-            "sha256": sha256,
-            "frames": len(source),
-            "frame_rate_hz": source.frame_rate_hz,
-            "shape": list(source.shape),
-            "warnings": list(source.warnings),
-            "index": None if index is None else index.decode(),
-        }
-    _write(recording_file(folder, recording), as_bytes(json.dumps(found)))
+        found = FoundRecording(
+            before,
+            size,
+            sha256,
+            len(source),
+            source.frame_rate_hz,
+            source.shape,
+            tuple(source.warnings),
+            source.index,
+        )
+    packed = None if found.index is None else base64.b64encode(zlib.compress(found.index)).decode()
+    content = {"format": FORMAT, **asdict(found), "index": packed}
+    _write(recording_file(folder, recording), as_bytes(json.dumps(content)))
 
 
 def found_recording(recording: Path, folder: Path) -> FoundRecording | None:
@@ -248,7 +248,7 @@ def measure_stretch(stretch: Stretch) -> None:
 
 def _measured(stretch: Stretch, measurer: Measurer) -> bytes:
     """Return the results of a stretch as the content of a file."""
-    rows: list[Table] = []
+    rows: list[Columns] = []
     residuals: list[tuple[int, Residuals]] = []
     surfaces: list[tuple[int, FloatArray, tuple[int, int]]] = []
     for result in measurer(stretch.frames):
@@ -334,7 +334,7 @@ class StretchFile:
             raise ValueError(f"{name} is damaged") from error
         return found
 
-    def measures(self) -> Table:
+    def measures(self) -> Columns:
         """Return the columns `plan.COLUMNS`, one row per frame."""
         table = {c.name: self._array(f"measures/{c.name}") for c in COLUMNS}
         frames = table["frame"].tolist()

@@ -30,7 +30,7 @@ from labapp.version import VERSION
 
 if TYPE_CHECKING:
     from labapp.export.features import FeatureTable
-    from labapp.export.tables import Table
+    from labapp.export.tables import Columns
     from labapp.run.study.summary import StudySummary
 
 MARKER = "study.json"
@@ -271,7 +271,7 @@ class Study:
 
     # --- results --------------------------------------------------------------------------------
 
-    def tables(self) -> dict[str, Table]:
+    def tables(self) -> dict[str, Columns]:
         """Return the columns ``plan.COLUMNS`` of each recording that has results.
 
         Raises

@@ -16,7 +16,7 @@ from labapp.core.sequence.mean import (
 )
 from labapp.core.surface.measures import SIZES, sigma_name
 from labapp.core.values import FloatArray
-from labapp.export.tables import Table
+from labapp.export.tables import Columns
 from labapp.run.study.plan import Condition
 from labapp.run.study.status import RecordingStatus
 
@@ -110,7 +110,7 @@ class StudySummary:
     outliers: tuple[Outlier, ...]
 
 
-def recording_means(table: Table) -> dict[str, Mean]:
+def recording_means(table: Columns) -> dict[str, Mean]:
     """Return the mean of each size over the frames with a surface; empty if there is none.
 
     Parameters
@@ -182,7 +182,7 @@ def _deviation(values: FloatArray) -> float:
     return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
 
 
-def outlying_frames(status: RecordingStatus, table: Table) -> list[Outlier]:
+def outlying_frames(status: RecordingStatus, table: Columns) -> list[Outlier]:
     """Return frames with a size far from the recording's median, the farthest first.
 
     Far is more than `FAR` times the robust standard deviation of the frames, and `FAR` times the

@@ -25,7 +25,7 @@ from typing import Any
 
 from labapp.errors import InputError
 from labapp.run.measurers import load_all, measuring_pool
-from labapp.simulation.parallel import POLL_S, end_processes
+from labapp.simulation.parallel import POLL_S, Here, end_processes
 from labapp.system import interrupts_blocked
 
 ATTEMPTS = 4
@@ -172,18 +172,6 @@ class _Processes(Executor):
             end_processes(pool, wait)
 
 
-class _Here(Executor):
-    """Runs each task immediately, in this process."""
-
-    def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(work(*given, **named))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
 @contextmanager
 def local_workers(count: int | None, tasks: int) -> Iterator[Workers]:
     """Start processes of this machine.
@@ -196,7 +184,7 @@ def local_workers(count: int | None, tasks: int) -> Iterator[Workers]:
         Number of tasks to expect: not more processes start at once, but when they are needed.
     """
     count = (os.cpu_count() or 1) if count is None else count
-    executor = _Processes(count, tasks) if count else _Here()
+    executor = _Processes(count, tasks) if count else Here()
     try:
         yield Workers(executor, lambda: max(count, 1))
     finally:

@@ -13,7 +13,7 @@ import stat
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -87,7 +87,7 @@ class Database:
             with (
                 atomic_file(path) as part,
                 _translated_errors(path),
-                _closing(_connect(part, read_only=False)) as connection,
+                closing(_connect(part, read_only=False)) as connection,
             ):
                 connection.execute("BEGIN IMMEDIATE")
                 for statement in TABLES:
@@ -125,7 +125,7 @@ class Database:
             with _translated_errors(path):
                 if read_only:
                     return cls._open_to_read(path)
-                with _closing(_connect(path, read_only=False)) as connection:
+                with closing(_connect(path, read_only=False)) as connection:
                     _roll_back(connection)
                 if (version := _check_header(path)) < VERSION:
                     _migrate(path, version)
@@ -153,7 +153,7 @@ class Database:
             shutil.copyfile(path, copy)
             if (journal := _journal_of(path)).exists():
                 shutil.copyfile(journal, _journal_of(copy))
-            with _closing(_connect(copy, read_only=False)) as connection:
+            with closing(_connect(copy, read_only=False)) as connection:
                 _roll_back(connection)
             _apply_migrations(copy, _check_header(copy), path)
             database = cls(copy, read_only=True, lock=None)
@@ -346,14 +346,6 @@ def _connect(path: Path, read_only: bool) -> sqlite3.Connection:
     return connection
 
 
-@contextmanager
-def _closing(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
-    try:
-        yield connection
-    finally:
-        connection.close()
-
-
 def _roll_back(connection: sqlite3.Connection) -> None:
     """Roll back an unfinished change, which SQLite does at the first read."""
     connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
@@ -389,7 +381,7 @@ def _apply_migrations(file: Path, version: int, path: Path, end: str = "COMMIT")
     InputError
         If the tables would not be those of a session; the file is unchanged then.
     """
-    with _closing(_connect(file, read_only=False)) as connection:
+    with closing(_connect(file, read_only=False)) as connection:
         connection.execute("BEGIN IMMEDIATE")
         for earlier in range(version, VERSION):
             for statement in MIGRATIONS[earlier]:

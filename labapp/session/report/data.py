@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from labapp.config.settings import differences
 from labapp.config.setup import Setup
 from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.core.matching.row_shape import match_row_shapes
@@ -339,22 +338,11 @@ def _row(figures: FloatArray, digits: Sequence[int]) -> list[str]:
 
 def settings_cells(settings: Settings) -> Cells:
     """Tabulate the settings that differ from the defaults."""
-    default = dict(_flat(Settings()))
     rows = [
-        [name, str(value), str(default[name])]
-        for name, value in _flat(settings)
-        if value != default[name]
+        [name, str(value), str(default)]
+        for name, (value, default) in differences(settings, Settings()).items()
     ]
     return [["setting", "value", "default"], *rows]
-
-
-def _flat(settings: Any, prefix: str = "") -> Iterable[tuple[str, object]]:
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if dataclasses.is_dataclass(value):
-            yield from _flat(value, f"{prefix}{field.name}.")
-        else:
-            yield prefix + field.name, value
 
 
 def rig_cells(setup: Setup, status: str = "") -> Cells:

@@ -113,7 +113,7 @@ class _Row(NamedTuple):
     content: bytes
 
 
-class Results:
+class StoredResults:
     """The results of a session."""
 
     def __init__(self, database: Database) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from labapp.core.values import FloatArray, IntArray
 from labapp.session.file.database import Database
 from labapp.session.file.schema import MEASURES
-from labapp.session.results.measured import Basis, Overview, Results
+from labapp.session.results.measured import Basis, Overview, StoredResults
 
 MANY = 500
 """Number of changed frames from which all are read, which takes no longer."""
@@ -61,7 +61,7 @@ class _Table:
 class Overviews:
     """The overviews of a session, one per scheme; thread-safe."""
 
-    def __init__(self, database: Database, results: Results) -> None:
+    def __init__(self, database: Database, results: StoredResults) -> None:
         self._database = database
         self._results = results
         self._mutex = threading.Lock()

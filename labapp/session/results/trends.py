@@ -20,11 +20,11 @@ FEWEST = 8
 """Fewest frames for this comparison, and for a spectrum."""
 
 FAR_SIGMA, FAR_PART = 6.0, 0.05
-"""A frame is doubtful if a size deviates from the median by more than both, in robust σ and as a
+"""A frame is outlying if a size deviates from the median by more than both, in robust σ and as a
 fraction of the median."""
 
 FAR_ARE = 3.0
-"""A frame is also doubtful if its ARE exceeds the median by this factor: a wrong column increases
+"""A frame is also outlying if its ARE exceeds the median by this factor: a wrong column increases
 it by a factor of 5, a wrong orientation by 10."""
 
 EVEN = 0.05
@@ -78,10 +78,10 @@ class Trend(ReadOnlyArrays):
     value: FloatArray
     sigma: FloatArray
     """Values and their σ, shape (n,), in the quantity's unit; σ is NaN if unknown."""
-    doubtful: BoolArray
+    outlying: BoolArray
     stale: BoolArray
     corrected: BoolArray
-    """Which are doubtful (`doubtful_frames`), stale, corrected manually, shape (n,)."""
+    """Which are outlying (`outlying_frames`), stale, corrected manually, shape (n,)."""
     counts: BoolArray
     """Which are included in the statistics and the spectrum, shape (n,)."""
     measures: Mapping[str, FloatArray]
@@ -89,7 +89,7 @@ class Trend(ReadOnlyArrays):
 
 
 @dataclass(frozen=True)
-class Spread:
+class Statistics:
     """Mean, standard deviation and range of a measure (Eq. 7-2 … 7-4)."""
 
     count: int
@@ -134,7 +134,7 @@ class Spectrum(ReadOnlyArrays):
 
 
 def trend(
-    seen: Overview, key: str, without_doubtful: bool = False, doubtful: BoolArray | None = None
+    seen: Overview, key: str, without_outlying: bool = False, outlying: BoolArray | None = None
 ) -> Trend:
     """Return the trend of a measure.
 
@@ -142,17 +142,17 @@ def trend(
     ----------
     key
         Name of the measure, one of `BY_KEY`.
-    without_doubtful
-        Whether doubtful frames are excluded from the statistics. Stale results always are.
-    doubtful
-        Result of `doubtful_frames`, if already known.
+    without_outlying
+        Whether outlying frames are excluded from the statistics. Stale results always are.
+    outlying
+        Result of `outlying_frames`, if already known.
     """
     quantity = BY_KEY[key]
     value = seen.measures[key]
     has = np.flatnonzero(np.isfinite(value))
     timed = bool(np.isfinite(seen.time_s).all())
-    doubtful = doubtful_frames(seen) if doubtful is None else doubtful
-    counts = ~seen.stale & ~(doubtful & without_doubtful)
+    outlying = outlying_frames(seen) if outlying is None else outlying
+    counts = ~seen.stale & ~(outlying & without_outlying)
     sigma = seen.measures[quantity.sigma] if quantity.sigma else np.full(len(value), np.nan)
     return Trend(
         quantity=quantity,
@@ -162,7 +162,7 @@ def trend(
         place=has.astype(np.int64),
         value=value[has],
         sigma=sigma[has],
-        doubtful=doubtful[has],
+        outlying=outlying[has],
         stale=seen.stale[has],
         corrected=seen.corrected[has],
         counts=counts[has],
@@ -170,16 +170,16 @@ def trend(
     )
 
 
-def doubtful_frames(seen: Overview) -> BoolArray:
+def outlying_frames(seen: Overview) -> BoolArray:
     """Return which frames have a surface that deviates from the neighbouring ones, shape (n,).
 
     These have a width, length or height far from the median of the neighbours, or an ARE far above
     the median. They should be inspected, but need not be wrong.
     """
-    doubtful = np.zeros(len(seen.frame), bool)
+    outlying = np.zeros(len(seen.frame), bool)
     has = np.isfinite(seen.measures["height_mm"]) & ~seen.stale
     if has.sum() < FEWEST:
-        return doubtful
+        return outlying
     are = seen.measures["are_mm"][has]
     out = are > FAR_ARE * np.nanmedian(are) if np.isfinite(are).any() else np.zeros(len(are), bool)
     for key in ("width_mm", "length_mm", "height_mm"):
@@ -190,17 +190,17 @@ def doubtful_frames(seen: Overview) -> BoolArray:
         out |= off > np.maximum(
             FAR_SIGMA * 1.4826 * np.nanmedian(off), FAR_PART * np.abs(np.nanmedian(size))
         )
-    doubtful[has] = out
-    return doubtful
+    outlying[has] = out
+    return outlying
 
 
-def spread(course: Trend) -> Spread:
+def statistics_of(course: Trend) -> Statistics:
     """Return mean, ±, standard deviation and range of the included frames (Eq. 7-2 … 7-4)."""
     value = course.value[course.counts]
     if not len(value):
-        return Spread(0, *(4 * (float("nan"),)))
+        return Statistics(0, *(4 * (float("nan"),)))
     key, counted = course.quantity.key, {k: v[course.counts] for k, v in course.measures.items()}
-    return Spread(
+    return Statistics(
         len(value),
         float(value.mean()),
         float(value.std()),

@@ -48,7 +48,7 @@ from labapp.run import live_watch
 from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits
 from labapp.run.live_measuring import LiveResult
-from labapp.run.live_trend import Pace, Trend
+from labapp.run.live_trend import LiveSizes, Pace
 from labapp.session.session import Session
 from labapp.text import SETUP_MARKS
 from tests.gui.conftest import SAMPLES
@@ -135,7 +135,7 @@ def test_colour_limits_stay_while_the_surface_fills_them():
 
 def test_trends_show_limits_and_mark_values_beyond_them():
     values = np.array([[6.7, np.nan, 7.0], [7.5] * 3, [-0.3] * 3])
-    trend = Trend(
+    trend = LiveSizes(
         ("width", "length", "depth"),
         np.array([4, 8, 10]),
         np.array([-2.0, -1.6, -0.1]),

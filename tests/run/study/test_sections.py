@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from labapp.errors import InputError
-from labapp.export.tables import Table
+from labapp.export.tables import Columns
 from labapp.run.study.plan import COLUMNS, Condition, StudyPlan, StudyRecording
 from labapp.run.study.sections import study_features
 
@@ -24,9 +24,9 @@ def plan(**conditions: Condition) -> StudyPlan:
     return StudyPlan("study", recordings, tuple(conditions))
 
 
-def measured(count: int = 50, rate_hz: float = 10.0) -> Table:
+def measured(count: int = 50, rate_hz: float = 10.0) -> Columns:
     """A recording whose width equals the frame number; every tenth frame has no surface."""
-    table: Table = {column.name: np.full(count, 1.0) for column in COLUMNS}
+    table: Columns = {column.name: np.full(count, 1.0) for column in COLUMNS}
     table["frame"] = np.arange(count)
     table["time_s"] = np.arange(count) / rate_hz
     table["width_mm"] = np.arange(float(count))

@@ -10,7 +10,7 @@ import pytest
 from labapp import Study
 from labapp.config.scenario import read_scenario
 from labapp.core.surface.measures import SIZES, sigma_name
-from labapp.export.tables import Table
+from labapp.export.tables import Columns
 from labapp.run.study.page import summary_page
 from labapp.run.study.plan import StudyRecording
 from labapp.run.study.status import RecordingStatus
@@ -29,10 +29,10 @@ from labapp.text import with_sigma
 NOISE, LEVEL, SETUP = 0.03, 0.02, 0.1
 
 
-def table(seed: int, frames: int = 50, offset: float = 0.0) -> Table:
+def table(seed: int, frames: int = 50, offset: float = 0.0) -> Columns:
     """Frames whose sizes scatter by their noise about 6 mm."""
     rng = np.random.default_rng(seed)
-    table: Table = {
+    table: Columns = {
         "frame": np.arange(frames),
         "status": np.array(["ok"] * frames),
         "center_x_mm": np.zeros(frames),
@@ -51,7 +51,7 @@ def status(name: str, **conditions: float | str) -> RecordingStatus:
     return RecordingStatus(recording, "done", "", 50, 50)
 
 
-def summary(name: str, frames: Table, **conditions: float | str) -> RecordingSummary:
+def summary(name: str, frames: Columns, **conditions: float | str) -> RecordingSummary:
     return RecordingSummary(
         status(name, **conditions), {"ok": 50}, "entered", "", recording_means(frames)
     )

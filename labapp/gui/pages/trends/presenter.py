@@ -21,7 +21,14 @@ from labapp.session.results.line_trends import (
     line_trend,
 )
 from labapp.session.results.measured import Overview
-from labapp.session.results.trends import BY_KEY, Trend, doubtful_frames, spectrum, spread, trend
+from labapp.session.results.trends import (
+    BY_KEY,
+    Trend,
+    outlying_frames,
+    spectrum,
+    statistics_of,
+    trend,
+)
 from labapp.session.session import Session
 from labapp.session.signals import Signals
 from labapp.text import SIGMA_OF, marked_setup_words
@@ -103,7 +110,7 @@ def show(
     seen, signals = seen or session.overview(), session.signals
     if session.has_lines:
         return _show_lines(session, options, seen)
-    doubtful = doubtful_frames(seen)
+    doubtful = outlying_frames(seen)
 
     def course_of(key: str) -> Trend:
         return trend(seen, key, options.without_doubtful, doubtful)
@@ -200,7 +207,7 @@ def _followed(x: FloatArray, shift_px: FloatArray, timed: bool) -> str:
 def _curve(course: Trend, events: Sequence[Event]) -> Curve:
     mark = np.full(len(course.frame), MEASURED)
     mark[course.corrected] = CORRECTED
-    mark[course.doubtful] = DOUBTFUL
+    mark[course.outlying] = DOUBTFUL
     mark[course.stale] = STALE
     return Curve(
         name=course.quantity.label,
@@ -211,14 +218,14 @@ def _curve(course: Trend, events: Sequence[Event]) -> Curve:
         key=course.frame,
         mark=np.asarray(mark, np.int64),
         marks=MARKS,
-        level=spread(course).mean,
+        level=statistics_of(course).mean,
         events=np.array([one.time_s for one in events if course.timed]),
         decimals=4 if course.quantity.key == "are_mm" else 3,
     )
 
 
 def _rows(course: Trend) -> tuple[ResultRow, ...]:
-    found, quantity = spread(course), course.quantity
+    found, quantity = statistics_of(course), course.quantity
     place = rounded(found.mean, found.deviation)[0].partition(".")[2]
     ends = [f"{end:.{len(place)}f}" for end in (found.lowest, found.highest)]
     frames = f"{found.count} frame{'s' * (found.count != 1)}"
@@ -247,7 +254,7 @@ def _counted(seen: Overview, course: Trend) -> str:
         (unmeasured, "not measured yet"),
         (total - has - unmeasured, "without a surface"),
         (int(course.stale.sum()), "out of date"),
-        (int(course.doubtful.sum()), "stand out"),
+        (int(course.outlying.sum()), "stand out"),
     )
     parts += [f"{count} {words}" for count, words in reasons if count]
     return ", ".join(parts)
