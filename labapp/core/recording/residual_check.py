@@ -94,7 +94,7 @@ FIXED = (
 
 
 @dataclass(frozen=True)
-class Suspect:
+class ResidualSuspect:
     """A quantity whose response is found in the residuals.
 
     Parameters
@@ -135,7 +135,7 @@ class SetupVerdict:
 
     is_doubtful: bool
     reason: str
-    suspects: tuple[Suspect, ...] = ()
+    suspects: tuple[ResidualSuspect, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -364,10 +364,12 @@ class _Unabsorbed(ReadOnlyArrays):
     freedom: int
     bent_mm: float
 
-    def suspects(self, tested: Sequence[Direction], *, is_drift: bool) -> tuple[Suspect, ...]:
+    def suspects(
+        self, tested: Sequence[Direction], *, is_drift: bool
+    ) -> tuple[ResidualSuspect, ...]:
         """Find the perturbations of the bench that explain the residuals, likeliest first."""
         left, weight = self.residual_mm, np.linalg.inv(self._covariance())
-        found: list[tuple[float, Suspect]] = []
+        found: list[tuple[float, ResidualSuspect]] = []
         seen = 0.0
         for one in tested:
             pattern = self.by_quantity @ one.vector
@@ -382,7 +384,7 @@ class _Unabsorbed(ReadOnlyArrays):
             is_visible = usual * size >= VISIBLE_MM
             seen = max(seen, drop) if is_visible else seen
             if is_visible or abs(off) <= IMPLAUSIBLE * usual:
-                suspect = Suspect(one.name, one.unit, off, sigma, abs(off) * size, is_drift)
+                suspect = ResidualSuspect(one.name, one.unit, off, sigma, abs(off) * size, is_drift)
                 found.append((drop, suspect))
         if seen < LIMIT:
             return ()
@@ -402,7 +404,7 @@ class _Unabsorbed(ReadOnlyArrays):
         return np.asarray(self.uncertain @ self.uncertain.T + (noise + floor) * np.eye(count))
 
 
-def _reason(suspects: Sequence[Suspect], frames: int) -> str:
+def _reason(suspects: Sequence[ResidualSuspect], frames: int) -> str:
     """Name in a clause the quantities that explain the residuals equally well."""
     first = suspects[0]
     alike = [one for one in suspects if one.is_drift == first.is_drift]

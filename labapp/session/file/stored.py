@@ -32,7 +32,7 @@ from labapp.core.lines.track import TrackedLine
 from labapp.core.match import Match, Trial
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.recording.residual_check import SetupVerdict, Suspect
+from labapp.core.recording.residual_check import ResidualSuspect, SetupVerdict
 from labapp.core.rows import find_lattice, lattice, lattice_growth, row_search
 from labapp.core.rows.correction import Correction
 from labapp.core.schemes import SCHEMES
@@ -255,7 +255,7 @@ STORED = {
         LineSurface, shapes={"covariance": "p p", "numbers": "k", "point_mm": "n 3"}
     ),
     "SetupVerdict": Stored(SetupVerdict),
-    "Suspect": Stored(Suspect),
+    "Suspect": Stored(ResidualSuspect),
 }
 """Classes in a session, by their names there."""
 
