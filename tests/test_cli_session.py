@@ -26,7 +26,7 @@ from labapp.errors import InputError
 from labapp.run import measurers
 from labapp.session.checklist import SAFETY, STEPS
 from labapp.session.frames import Frames
-from labapp.session.results.measured import Results
+from labapp.session.results.measured import StoredResults
 from labapp.session.session import Session
 from tests.conftest import Run
 from tests.same import assert_same
@@ -448,14 +448,14 @@ def test_failed_measure_command_changes_nothing(
 def test_interrupted_measuring_reports_finished_frames(
     labapp: Run, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    put = Results.put
+    put = StoredResults.put
 
-    def put_until_full(results: Results, frame: int, *arguments: Any) -> None:
+    def put_until_full(results: StoredResults, frame: int, *arguments: Any) -> None:
         if frame == 2:
             raise InputError(file, "disk", "no space left", "room on the disk")
         put(results, frame, *arguments)
 
-    monkeypatch.setattr(Results, "put", put_until_full)
+    monkeypatch.setattr(StoredResults, "put", put_until_full)
     code, stdout, stderr = labapp("session", "measure", file)
     assert (code, stdout) == (2, "")
     assert stderr.splitlines() == [

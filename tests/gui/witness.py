@@ -16,7 +16,7 @@ from unittest import mock
 from labapp.session.documents import Documents
 from labapp.session.file.blobs import pack, unpack
 from labapp.session.frames import Frames
-from labapp.session.results.measured import Results
+from labapp.session.results.measured import StoredResults
 
 Key = tuple[str, int]
 Values = dict[Key, bytes | None]
@@ -100,7 +100,7 @@ class Witness:
             self._after(Documents, "undo", lambda expected, *_: expected.step(back=True)),
             self._after(Documents, "redo", lambda expected, *_: expected.step(back=False)),
             self._after(Frames, "import_recording", self._imported),
-            self._after(Results, "put", self._measured),
+            self._after(StoredResults, "put", self._measured),
         ):
             yield
 
