@@ -231,17 +231,17 @@ class DotsPage(Page):
 
     def _show_unmet_needs(self) -> None:
         """Disable edits whose needs are not met."""
-        seen, editor = self.seen, self.editor
-
-        def unmet_need(need: Need) -> str:
-            return self.locked or presenter.unmet_need(need, seen, editor.selection, editor.rows)
-
-        found = {text: unmet_need(need) for text, need in self._needs.items()}
+        found = {text: self._unmet_need(need) for text, need in self._needs.items()}
         if found != self._unmet:  # a drag draws the marks all the time
             self._unmet = found
-            self.dots_panel.lock_sites(unmet_need("dots"), unmet_need(""))
+            self.dots_panel.lock_sites(self._unmet_need("dots"), self._unmet_need(""))
             if self.dots_panel.show_unmet_needs(found):
                 self.view.setFocus()  # otherwise the focus would move to another button
+
+    def _unmet_need(self, need: Need) -> str:
+        """Say why an edit with a need cannot be made now; empty if it can."""
+        chosen, rows = self.editor.selection, self.editor.rows
+        return self.locked or presenter.unmet_need(need, self.seen, chosen, rows)
 
     def choose(self, way: Callable[..., None], *given: object) -> None:
         """Select dots by a function, and show the selection."""
@@ -369,7 +369,7 @@ class DotsPage(Page):
 
     def _run(self, command: Command) -> None:
         """Run a command, or report what it needs."""
-        if why := self._unmet.get(command.text, ""):
+        if command.text in self._needs and (why := self._unmet_need(command.needs)):
             self.workspace.notified.emit(why, True)
         else:
             command.do()
