@@ -237,7 +237,8 @@ def test_frames_are_measured_if_the_setup_is_complete(live: Live):
     first, measured = [each for each in results if each is not None]
     assert (first.measurement.status, measured.measurement.status) == ("ok", "ok")
     assert (first.track_lost is None, measured.track_lost is None) == (False, True)
-    assert measured.quality.reference
+    grades = {remark.about: remark.grade for remark in measured.quality.remarks}
+    assert grades["reference"] == "good"
     width, length, height = figures(measured)
     with (folder / "truth.csv").open() as file:
         truth = next(csv.DictReader(file))
