@@ -12,10 +12,20 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 
+from labapp.config.settings import check_algorithm, check_settings
+from labapp.core import schemes
+from labapp.core.pipeline import Settings, reconstruct
+from labapp.errors import InputError
+from labapp.session.file.blobs import Damaged, pack, unpack
+from labapp.session.file.stored import NAMES, STORED, Stored
+from labapp.session.results.measured import scheme_name
 from tests.waiting import PATIENCE_S
 
 SAMPLE = Path(__file__).parents[1] / "sample_sessions" / "gtaw"
@@ -173,3 +183,93 @@ def test_sessions_and_pages_offer_an_added_scheme(python: Python, tmp_path: Path
     process = python("-m", "labapp", "session", "export", file, *options)
     assert process.returncode == 0, process.stderr
     assert ",ok,toy," in (out / "measures.csv").read_text("utf-8").splitlines()[1]
+
+
+@dataclass(frozen=True)
+class TwoSettings:
+    """Settings of a scheme of two algorithms."""
+
+    algorithm: str = "one"
+
+
+@dataclass(frozen=True)
+class SettingsOfTwo(Settings):
+    """Settings with those of the scheme."""
+
+    two: TwoSettings = TwoSettings()
+
+
+@pytest.fixture
+def two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Add a scheme of two algorithms, whose result is its settings."""
+    words = {name: schemes.Words(name, f"Two: {name}") for name in ("one", "other")}
+    scheme = schemes.Scheme("two", "a toy (of two)", words, "TwoSettings")
+    monkeypatch.setitem(schemes.SCHEMES, "two", scheme)
+    module: Any = ModuleType("labapp.core.schemes.two")
+    module.reconstruct = lambda match, rig, settings: settings
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+
+
+@pytest.mark.usefixtures("two")
+@pytest.mark.parametrize(
+    ("chosen", "used"), [("opa", "one"), ("epa-r", "one"), ("one", "one"), ("other", "other")]
+)
+def test_scheme_of_two_algorithms_uses_its_own(chosen: str, used: str) -> None:
+    settings = SettingsOfTwo(scheme="two", algorithm=chosen)
+    nothing: Any = SimpleNamespace()
+    assert reconstruct(nothing, nothing, settings) == TwoSettings(used)  # type: ignore[comparison-overlap]
+    assert scheme_name(settings) == f"two-{used}"
+    check_settings(settings, "measure")
+    if chosen != "epa-r":
+        check_algorithm(settings, "measure")
+    plain = Settings(scheme="two", algorithm=chosen)
+    assert unpack(pack(plain), Settings) == plain
+
+
+@pytest.mark.usefixtures("two")
+@pytest.mark.parametrize(
+    ("scheme", "algorithm", "expected"),
+    [
+        ("two", "epa-r", "one of one, other"),
+        ("irs", "other", "one of opa, epa-r, epa-c, epa-rc"),
+        ("fit", "other", "scheme two, which alone has it, instead of fit"),
+        ("fit", "epa-r", "scheme irs, which alone has it, instead of fit"),
+    ],
+)
+def test_algorithm_of_another_scheme_is_refused(scheme: str, algorithm: str, expected: str) -> None:
+    with pytest.raises(InputError) as caught:
+        check_algorithm(Settings(scheme=scheme, algorithm=algorithm), "measure")
+    assert (caught.value.field, caught.value.expected) == ("algorithm", expected)
+
+
+@pytest.mark.parametrize("field", ["scheme", "settings"])
+def test_settings_of_a_missing_scheme_are_named(
+    field: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as changed:
+        if field == "scheme":
+            name = "two"
+            blob = pack(Settings(scheme=name))
+        else:
+            name = TwoSettings.__name__
+            changed.setitem(STORED, name, Stored(TwoSettings))
+            changed.setitem(NAMES, TwoSettings, name)
+            blob = pack(TwoSettings())
+    with pytest.raises(Damaged) as caught:
+        unpack(blob)
+    assert "written by a labapp with other" in str(caught.value)
+    assert repr(name) in str(caught.value)
+
+
+@pytest.mark.parametrize("scheme", schemes.SCHEMES)
+def test_algorithm_that_no_scheme_has_is_refused(scheme: str) -> None:
+    settings = Settings(scheme=scheme, algorithm="other")
+    with pytest.raises(InputError) as caught:
+        check_settings(settings, "measure")
+    assert caught.value.field == "settings.algorithm"
+    assert caught.value.expected.endswith("one of opa, epa-r, epa-c, epa-rc")
+    with pytest.raises(Damaged):
+        unpack(pack(settings), Settings)
+    assert scheme_name(replace(settings, algorithm="opa")) == (
+        "irs-opa" if scheme == "irs" else scheme
+    )

@@ -731,6 +731,38 @@ def test_calibrate_plane_uses_the_lens_of_a_setup_with_a_byte_order_mark(
 
 
 @pytest.mark.parametrize(
+    ("keys", "key"),
+    [
+        ("focal_px = [900, 900]\ncenter_px = [240, 320]", "distortion: missing"),
+        ("distortion = [-0.3, 0, 0, 0, 0]", "center_px: missing"),
+        (
+            "focal_px = [900, -900]\ncenter_px = [240, 320]\ndistortion = [0, 0, 0, 0, 0]",
+            "focal_px: [900, -900]",
+        ),
+        ("focal_pixel = [900, 900]", "focal_pixel: unknown key"),
+    ],
+)
+def test_calibrate_plane_rejects_an_incomplete_lens(
+    labapp: Run, tmp_path: Path, keys: str, key: str
+) -> None:
+    setup = tmp_path / "setup.toml"
+    before = f"{SETUP.read_text('utf-8')}[camera_lens]\n{keys}\n"
+    setup.write_text(before, "utf-8")
+    code, _, stderr = labapp("calibrate", "plane", SAMPLE / "calibration.png", "--setup", setup)
+    assert code == 2
+    assert f"{setup}: camera_lens.{key}" in stderr
+    assert setup.read_text("utf-8") == before
+
+
+def test_calibrate_plane_accepts_uncertainties_without_a_lens(labapp: Run, tmp_path: Path) -> None:
+    setup = tmp_path / "setup.toml"
+    keys = "[camera_lens]\ndistortion_percent_sigma = 0.2\n"
+    setup.write_text(SETUP.read_text("utf-8") + keys, "utf-8")
+    code, _, stderr = labapp("calibrate", "plane", SAMPLE / "calibration.png", "--setup", setup)
+    assert code == 0, stderr
+
+
+@pytest.mark.parametrize(
     ("start", "problem"),
     [
         ("# 30° to the work piece\n".encode("latin-1"), "encoding: not UTF-8"),

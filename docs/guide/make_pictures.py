@@ -26,7 +26,7 @@ def main() -> None:
         for old in PICTURES.glob("*.png"):
             old.unlink()
         for name in sorted(wanted):
-            (taken,) = Path(out).glob(f"[0-9][0-9]-{name}.png")
+            (taken,) = Path(out).glob(f"[0-9][0-9][0-9]-{name}.png")
             picture = Image.open(taken).convert("RGB")
             # The few bright points among much grey must keep their colours.
             few = picture.quantize(

@@ -16,6 +16,7 @@ import typer
 
 from labapp.cli.shared import (
     ABOUT_SCHEMES,
+    ALGORITHM_HELP,
     DETECTOR_HELP,
     FRAMES_HELP,
     FRAMES_METAVAR,
@@ -69,7 +70,7 @@ def reconstruct(
     ] = "fit",
     algorithm: Annotated[
         Algorithm,
-        typer.Option(help="Algorithm of IRS; not used by the other schemes."),
+        typer.Option(help=ALGORITHM_HELP[0].upper() + ALGORITHM_HELP[1:]),
     ] = "opa",
     correspondence: Annotated[
         Literal["auto", "S/S", "S/I", "I/I"],

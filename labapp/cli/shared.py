@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 import typer
 import typer.core
 
-from labapp.core.schemes import SCHEMES, scheme_words
+from labapp.core.schemes import SCHEMES, algorithm_names, scheme_words
 from labapp.errors import InputError, os_errors_as_input
 from labapp.files import write_file
 from labapp.session.results.statuses import is_failed
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from labapp.config.setup import Setup
     from labapp.core.pipeline import Settings
-    from labapp.core.schemes import irs
     from labapp.export.frame_result import FrameResult
     from labapp.export.summary import Summary
     from labapp.run.runner import Sink
@@ -35,13 +34,16 @@ if TYPE_CHECKING:
 
     SchemeName: TypeAlias = str
     ResultsName: TypeAlias = str
-    Algorithm: TypeAlias = irs.Algorithm
+    Algorithm: TypeAlias = str
 else:  # typer reads the allowed values of an option from its type
     SchemeName = Literal[tuple(SCHEMES)]
     ResultsName = Literal[tuple(scheme_words())]
-    Algorithm = Literal[tuple(name for one in SCHEMES.values() for name in one.algorithms)]
+    Algorithm = Literal[algorithm_names()]
 
 ABOUT_SCHEMES = ", ".join(scheme.about for scheme in SCHEMES.values())
+ALGORITHM_HELP = "algorithm of {}; not used by the other schemes.".format(
+    " or ".join(one.about.partition(" (")[0] for one in SCHEMES.values() if one.algorithms)
+)
 
 TERMINATED, INTERRUPTED, FAULT, BAD_INPUT, NOTHING_MEASURED = 143, 130, 3, 2, 1
 """Exit codes besides 0. `NOTHING_MEASURED`: nothing was measured, or a session is not whole."""

@@ -10,7 +10,7 @@ from labapp.core.images.find_dots import DotSettings
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.pipeline import Settings
 from labapp.core.rows.find_lattice import LatticeSettings
-from labapp.core.schemes import SCHEMES
+from labapp.core.schemes import SCHEMES, algorithm_names
 from labapp.core.schemes.irs import IrsSettings
 from labapp.errors import InputError, require, unknown_name
 
@@ -27,7 +27,7 @@ def check_settings(settings: Settings, source: str) -> None:
     require(settings, Settings, source, "settings", "labapp.core.pipeline.Settings")
     named = (
         ("scheme", settings.scheme, tuple(SCHEMES)),
-        ("algorithm", settings.algorithm, SCHEMES["irs"].algorithms),
+        ("algorithm", settings.algorithm, algorithm_names()),
         ("correspondence", settings.correspondence, _choices(Settings, "correspondence")),
         ("dots.method", settings.dots.method, _choices(DotSettings, "method")),
         ("lattice.method", settings.lattice.method, _choices(LatticeSettings, "method")),
@@ -69,10 +69,15 @@ def check_algorithm(settings: Settings, source: str | Path, field: str = "algori
     Raises
     ------
     InputError
-        If the scheme has no algorithms, and would ignore the one named.
+        If the scheme does not have the algorithm, and would ignore it.
     """
-    if settings.algorithm != Settings.algorithm and not SCHEMES[settings.scheme].algorithms:
-        expected = f"scheme irs, which alone has it, instead of {settings.scheme}"
+    own = SCHEMES[settings.scheme].algorithms
+    if settings.algorithm not in (Settings.algorithm, *own):
+        owners = [name for name, one in SCHEMES.items() if settings.algorithm in one.algorithms]
+        which = "which alone has it" if len(owners) == 1 else "which have it"
+        expected = f"scheme {' or '.join(owners)}, {which}, instead of {settings.scheme}"
+        if own:
+            expected = f"one of {', '.join(own)}"
         raise InputError(source, field, settings.algorithm, expected)
 
 

@@ -23,7 +23,7 @@ from labapp.config.bench_check import (
 )
 from labapp.config.ray_file import text_with_rays
 from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
-from labapp.config.setup_text import frame_px_of, image_calibration_of
+from labapp.config.setup_text import frame_px_of, image_calibration_of, incomplete_lens
 from labapp.config.toml_keys import (
     check_keys,
     parse_toml,
@@ -342,13 +342,8 @@ def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
         expected = f"a number below the plane's distance, {plane['distance_mm']:g} (mm)"
         glass = plane["glass_mm"]
         problems.append(InputError(path, "imaging_plane.glass_mm", glass, expected))
-    lens = {"focal_px", "center_px", "distortion"}
-    lacking = sorted(lens - values.get("camera_lens", {}).keys())
-    if 0 < len(lacking) < len(lens):
-        problems.append(
-            InputError(path, f"camera_lens.{lacking[0]}", "missing", "all of the lens, or none")
-        )
-        return problems
+    if incomplete := incomplete_lens(path, values.get("camera_lens", {})):
+        return problems + incomplete
     try:
         _calibration(values)
     except ValueError as error:

@@ -148,7 +148,7 @@ SECTIONS = {
             required=False,
         ),
         "kind": Rule(
-            f"one of {', '.join([*PATTERNS, MEASURED])}",
+            f"one of {', '.join([*PATTERNS, MEASURED, LINES])}",
             lambda value: isinstance(value, str) and (value in PATTERNS or value == MEASURED),
             required=False,
         ),

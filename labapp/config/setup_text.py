@@ -15,6 +15,10 @@ from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.rig import DotPattern
 from labapp.core.geometry.uncertainty import ENDINGS
 from labapp.core.values import FloatArray
+from labapp.errors import InputError
+
+LENS = ("focal_px", "center_px", "distortion")
+"""Keys of the lens of the camera."""
 
 
 def pattern_kind(text: str) -> str:
@@ -26,11 +30,36 @@ def pattern_kind(text: str) -> str:
 def lens_of(text: str) -> Lens | None:
     """Lens of the camera; None if there is none."""
     keys = _section(text, "camera_lens")
-    names = ("focal_px", "center_px", "distortion")
-    lens: dict[str, Any] = {name: keys.get(name) for name in names}
+    lens: dict[str, Any] = {name: keys.get(name) for name in LENS}
     if check_keys(Path(), "camera_lens", lens, SECTIONS["camera_lens"]):
         return None
     return Lens(**{name: tuple(value) for name, value in lens.items()})
+
+
+def check_lens(text: str, path: Path) -> None:
+    """Check the lens of the camera in the text of a file; the file needs none.
+
+    Raises
+    ------
+    InputError
+        If a key of its section is unknown or invalid, or the lens is incomplete.
+    """
+    keys = _value(text, "camera_lens")
+    problems = (
+        [] if keys is None else check_keys(path, "camera_lens", keys, SECTIONS["camera_lens"])
+    )
+    if isinstance(keys, dict):
+        problems += incomplete_lens(path, keys)
+    if problems:
+        raise InputError.gather(problems)
+
+
+def incomplete_lens(path: Path, keys: Mapping[str, Any]) -> list[InputError]:
+    """Problem of a section with some of the keys of a lens, but not all; empty if it has none."""
+    lacking = sorted(set(LENS) - keys.keys())
+    if not 0 < len(lacking) < len(LENS):
+        return []
+    return [InputError(path, f"camera_lens.{lacking[0]}", "missing", "all of the lens, or none")]
 
 
 def three_points(text: str) -> FloatArray | None:
@@ -68,8 +97,13 @@ def frame_px_of(text: str) -> tuple[int, int] | None:
 
 def _section(text: str, name: str) -> dict[str, Any]:
     """A section of the text of a setup; empty if it is missing or the text is not TOML."""
-    try:
-        section = tomllib.loads(text).get(name)
-    except (ValueError, RecursionError):  # ValueError: too many digits, too
-        return {}
+    section = _value(text, name)
     return section if isinstance(section, dict) else {}
+
+
+def _value(text: str, name: str) -> object:
+    """A value of the text of a setup; None if it is missing or the text is not TOML."""
+    try:
+        return tomllib.loads(text).get(name)
+    except (ValueError, RecursionError):  # ValueError: too many digits, too
+        return None

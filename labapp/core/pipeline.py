@@ -63,7 +63,8 @@ class Settings:
     scheme
         One of `SCHEMES`.
     algorithm
-        IRS algorithm: ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``. Overrides that of ``irs``.
+        Algorithm of the scheme, for IRS ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``. Overrides
+        that in the scheme's settings; for one that the scheme does not have, it uses its first.
     correspondence
         ``auto``, or the orientation to use (`match.Orientation`). Overrides that of ``match``.
     dots, lattice, match
@@ -73,7 +74,7 @@ class Settings:
     """
 
     scheme: str = "fit"
-    algorithm: irs.Algorithm = "opa"
+    algorithm: str = "opa"
     correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
     dots: DotSettings = field(default_factory=DotSettings)
     lattice: LatticeSettings = field(default_factory=LatticeSettings)
@@ -320,7 +321,7 @@ def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
     scheme = SCHEMES[settings.scheme]
     options: Any = getattr(settings, scheme.name) if scheme.settings else None
     if scheme.algorithms:
-        options = replace(options, algorithm=settings.algorithm)
+        options = replace(options, algorithm=scheme.algorithm(settings.algorithm))
     return scheme.reconstruct(match, rig, options)
 
 

@@ -19,9 +19,16 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
-from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS, RunFormat, mesh_formats
+from labapp.export.formats import (
+    FILM_FILE,
+    MANIFEST,
+    RUN_FORMATS,
+    SURFACE_FORMATS,
+    TREND_FILE,
+    RunFormat,
+    mesh_formats,
+)
 from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SMALLEST_SPACING_MM, SPACING_MM, refuse_too_large
 from labapp.export.rendering.drawing import VIEWS, Direction
@@ -42,10 +49,7 @@ from labapp.system import sync_folder
 from labapp.text import SIGMA_OF, now
 from labapp.version import VERSION
 
-MANIFEST = "manifest.json"
-TREND_FILE = "trends.png"
 TREND = ("width", "length", "height")
-FILM_FILE = "film.mp4"
 OLD = ".old"
 PICTURES = ("frames", "surfaces", "trends", "film")
 
@@ -55,9 +59,7 @@ SIZES_PX = range(320, 3841, 2)
 UNITS = (
     "lengths in mm, angles in degrees, times in s, places in a frame in px; see the column names"
 )
-
 LARGEST_MANIFEST = 1 << 28
-
 AN_EXPORT = "a folder that labapp exported"
 ROOM = "a writable folder with enough disk space; the former content is unchanged"
 OWN_FOLDER = "a new or empty folder, or an unchanged earlier export (it is replaced)"
@@ -334,7 +336,8 @@ def _write_results(
                 files.add(name, content)
             for writer in together:
                 writer.write(frame, tables, reconstruction)
-            if image_of is not None and _has_picture(measurement, choice):
+            drawn = "frames" in choice.pictures and measurement.status != "unreadable"
+            if image_of is not None and drawn:
                 path = files.new(f"frame_{frame:06d}.{choice.picture_format}")
                 write_frame_picture(path, image_of(frame), measurement)
             if process is not None and reconstruction is not None:
@@ -347,10 +350,6 @@ def _write_results(
     if "trends" in choice.pictures and summary.example is not None:
         _draw_trend(files.new(TREND_FILE), summary)
     return summary, extent
-
-
-def _has_picture(measurement: Measurement, choice: ExportChoice) -> bool:
-    return "frames" in choice.pictures and measurement.status != "unreadable"
 
 
 def _made() -> dict[str, object]:

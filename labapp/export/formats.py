@@ -24,6 +24,13 @@ if TYPE_CHECKING:
     from labapp.export.tables import Columns
 
 
+MANIFEST, TREND_FILE, FILM_FILE = "manifest.json", "trends.png", "film.mp4"
+REPORT_FILE = "report.pdf"
+"""Files of an export that no added format may write, as the tables' CSV files."""
+
+_NUMBERED = re.compile(r"(surface|solid|frame)_\d{6}", re.IGNORECASE)
+
+
 @dataclass(frozen=True)
 class SurfaceFormat:
     """A format with one file per frame that has a surface.
@@ -31,7 +38,8 @@ class SurfaceFormat:
     Parameters
     ----------
     end
-        End of its file names, after ``surface_NNNNNN``.
+        End of its file names, after ``surface_NNNNNN``: letters, digits, hyphens and dots, the
+        extension last; not ``.png``, as surface pictures have it.
     title, tip
         Name and description on the Export page.
     of
@@ -98,7 +106,7 @@ class RunFormat:
     Parameters
     ----------
     file
-        Name of the file in the export's folder.
+        Name of the file in the export's folder, which no other file of an export may have.
     title, tip
         Name and description on the Export page.
     writer
@@ -185,7 +193,8 @@ def add_export_format(name: str, added: SurfaceFormat | RunFormat) -> None:
     Raises
     ------
     InputError
-        If the name is invalid, or another format has the name or writes the same file.
+        If the name, the data or the file name is invalid, or another format has the name or writes
+        the same file.
     """
     source = f"export format {name}"
     if not isinstance(added, SurfaceFormat | RunFormat):
@@ -195,13 +204,35 @@ def add_export_format(name: str, added: SurfaceFormat | RunFormat) -> None:
     if name in SURFACE_FORMATS or name in RUN_FORMATS:
         raise InputError(source, "name", name, "a name that no other format has")
     if isinstance(added, SurfaceFormat):
-        if added.end in {each.end for each in SURFACE_FORMATS.values()}:
-            raise InputError(source, "end", added.end, "an end that no other format has")
+        _check_surface_format(source, added)
         SURFACE_FORMATS[name] = added
     else:
-        if added.file in {each.file for each in RUN_FORMATS.values()}:
-            raise InputError(source, "file", added.file, "a file that no other format has")
+        _check_run_format(source, added)
         RUN_FORMATS[name] = added
+
+
+def _check_surface_format(source: str, added: SurfaceFormat) -> None:
+    if added.of not in ("mesh", "nodes"):
+        raise InputError(source, "of", added.of, "nodes or mesh")
+    if not re.fullmatch(r"(?!\d)[\w.-]*\.\w+", str(added.end)):
+        raise InputError(source, "end", added.end, "an end such as .xyz or _fine.xyz")
+    if added.end.lower() == ".png":
+        raise InputError(source, "end", added.end, "another end: surface pictures have this one")
+    if added.end.lower() in {each.end.lower() for each in SURFACE_FORMATS.values()}:
+        raise InputError(source, "end", added.end, "an end that no other format has")
+
+
+def _check_run_format(source: str, added: RunFormat) -> None:
+    from labapp.export.tables import TABLES
+
+    if not re.fullmatch(r"\w([\w .,+()-]*[\w)])?", str(added.file)):
+        raise InputError(source, "file", added.file, "a plain file name such as points.json")
+    own = (MANIFEST, TREND_FILE, FILM_FILE, REPORT_FILE, *(f"{table}.csv" for table in TABLES))
+    # Without regard to case, as file systems of Windows and macOS.
+    if added.file.lower() in own or _NUMBERED.match(added.file):
+        raise InputError(source, "file", added.file, "a name that labapp's own files do not have")
+    if added.file.lower() in {each.file.lower() for each in RUN_FORMATS.values()}:
+        raise InputError(source, "file", added.file, "a file that no other format has")
 
 
 def _add_installed() -> None:

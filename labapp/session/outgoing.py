@@ -12,6 +12,7 @@ import numpy as np
 
 from labapp.errors import PATH, InputError, os_errors_as_input, require
 from labapp.export.folder import ExportChoice, ExportedFile, export
+from labapp.export.formats import REPORT_FILE
 from labapp.export.frame_result import FrameResult
 from labapp.export.line_results import line_tables, of_lines
 from labapp.export.rendering.drawing import Camera, Direction
@@ -62,7 +63,7 @@ def export_session(
         _provenance(session, scheme, numbers),
         choice,
         image_of=lambda number: session.frame(number).image,
-        extras={"report.pdf": write_report} if report else None,
+        extras={REPORT_FILE: write_report} if report else None,
         progress=lambda done: report_progress(before + done, total),
     )
 

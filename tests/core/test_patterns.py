@@ -94,8 +94,9 @@ def test_simulation_and_measurement_have_the_same_rays() -> None:
 
 
 @pytest.mark.slow
-def test_frame_of_an_added_kind_is_measured() -> None:
-    rig = replace(BENCH, pattern=DotPattern(kind="stretched"))
+@pytest.mark.parametrize("kind", [*PATTERNS, "stretched"])
+def test_frame_of_every_kind_is_measured(kind: str) -> None:
+    rig = replace(BENCH, pattern=DotPattern(kind=kind))
     frame = rendered(spherical_cap(6.0, 0.3), rig, 0)
     result = measure(frame.image, Bench(rig, axes_of(VIEW).calibration), Settings())[0]
     assert result.status == "ok", result.reason
@@ -105,7 +106,7 @@ def test_frame_of_an_added_kind_is_measured() -> None:
     true_px = frame.dot_px[tuple(result.match.ray.T - 1)]
     assert result.dots is not None
     assert np.abs(result.dots.image_px[result.match.dot] - true_px).max() < 3
-    assert result.measures.height_mm == pytest.approx(0.3, abs=0.01)
+    assert result.measures.height_mm == pytest.approx(0.3, abs=0.002)
 
 
 def test_hexagonal_pattern_is_a_hexagon_of_rays() -> None:

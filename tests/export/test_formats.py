@@ -184,6 +184,51 @@ def test_added_format_needs_a_new_name_and_suffix() -> None:
         del SURFACE_FORMATS["toy"]
 
 
+@pytest.mark.parametrize(
+    ("added", "field", "value"),
+    [
+        (SurfaceFormat(".bad", "S", "t", "other", xyz), "of", "other"),  # type: ignore[arg-type]
+        *(
+            (SurfaceFormat(end, "S", "t", "nodes", xyz), "end", end)
+            for end in ("", "bad", ".", "/../x.bad", ".b/d", "\\x.bad", ".bad ", ".b:d", "1.bad")
+        ),
+        *((SurfaceFormat(end, "S", "t", "mesh", off), "end", end) for end in (".png", ".PNG")),
+        (SurfaceFormat(".STL", "S", "t", "mesh", off), "end", ".STL"),
+        *(
+            (RunFormat(file, "R", "t", Frames), "file", file)
+            for file in (
+                *("", ".", "..", ".bad", "a/b.bad", "a\\b.bad", "../b.bad", "b.bad ", "b:d.bad"),
+                *("manifest.json", "Manifest.JSON", "trends.png", "film.mp4", "report.pdf"),
+                *("measures.csv", "dots.csv", "points.csv", "boundary.csv", "Results.h5"),
+                *("surface_000003.bad", "solid_000003.bad", "frame_000003.png"),
+            )
+        ),
+    ],
+)
+def test_format_that_could_not_be_written_is_refused(
+    added: SurfaceFormat | RunFormat, field: str, value: str
+) -> None:
+    before = dict(SURFACE_FORMATS), dict(RUN_FORMATS)
+    with pytest.raises(InputError) as caught:
+        add_export_format("bad", added)
+    assert (caught.value.field, caught.value.value) == (field, value)
+    assert before == (SURFACE_FORMATS, RUN_FORMATS)
+
+
+@pytest.mark.parametrize(
+    "added",
+    [
+        SurfaceFormat("_fine-1.tar.gz", "S", "t", "mesh", off),
+        RunFormat("My results (all).json", "R", "t", Frames),
+        RunFormat("surfaces.json", "R", "t", Frames),
+    ],
+)
+def test_plain_file_names_are_accepted(added: SurfaceFormat | RunFormat) -> None:
+    registry = SURFACE_FORMATS if isinstance(added, SurfaceFormat) else RUN_FORMATS
+    add_export_format("fine", added)
+    assert registry.pop("fine") is added
+
+
 def test_writer_that_returns_no_bytes_is_named() -> None:
     text = SurfaceFormat(".toy", "Toy", "A toy, mm", "nodes", lambda nodes: str(len(nodes)))
     with pytest.raises(InputError) as caught:

@@ -27,7 +27,8 @@ if __name__ == "__main__":
 
 from PySide6.QtWidgets import QApplication
 
-from labapp.export.folder import MANIFEST, verify_export
+from labapp.export.folder import verify_export
+from labapp.export.formats import MANIFEST
 from labapp.log import NAME
 from labapp.session.file.database import SUFFIX
 from labapp.session.session import Session

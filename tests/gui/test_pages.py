@@ -1,4 +1,4 @@
-"""An added page appears everywhere: in list, menu, keys, guide, window and tour."""
+"""An added page appears everywhere: in list, menu, keys, window and tour."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ app = start_app()
 from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences
 from labapp.gui.shell.commands import make_window
-from labapp.gui.shell.help import guide, keys
+from labapp.gui.shell.help import keys
 from labapp.session.session import Session
 from tests.tour import way
 
@@ -64,7 +64,7 @@ found = {
     "listed": [listed.item(row).toolTip() for row in range(listed.count())],
     "keys": [action.shortcut().toString(), "Ctrl+9" in keys()],
     "enabled": action.isEnabled(),
-    "guide": "Play with the toy." in guide(),
+    "told": "Play with the toy." in keys(),
     "in view": [window.page.key, window.page.shown > 0, window.page.accessibleName()],
     "panel": [panel.title.text(), panel.hint.text(), panel.state.text()],
     "tour": told,
@@ -91,19 +91,22 @@ def test_added_page_appears_everywhere(tmp_path: Path):
     )
     assert process.returncode == 0, process.stderr
     report = json.loads(process.stdout.splitlines()[-1])
-    assert [tip.partition(":")[0] for tip in report["listed"]][-2:] == ["9 Export", "10 The toy"]
-    assert report["keys"] == ["", True]  # the tenth step has no digit key
+    assert [tip.partition(":")[0] for tip in report["listed"]][-2:] == [
+        f"{len(STEPS)} {STEPS[-1].title}",
+        f"{len(STEPS) + 1} The toy",
+    ]
+    assert report["keys"] == ["Ctrl+0", True]  # the toy is the tenth step
     assert report["enabled"]
-    assert report["guide"]
+    assert report["told"]
     assert report["in view"] == ["toy", True, "The toy"]
     assert report["panel"][:2] == ["The toy", "Play with the toy."]
     assert report["panel"][2].endswith("30 frames")
     assert report["tour"] == ["step_toy", "a picture"]
-    assert report["before"] == "export"
+    assert report["before"] == STEPS[-1].key
 
 
-def test_first_nine_steps_have_digit_shortcuts():
+def test_first_ten_steps_have_digit_shortcuts():
     keys = {action.name: action.key for action in ACTIONS}
-    assert [keys[f"step_{step.key}"] for step in STEPS[:9]] == [
-        f"Ctrl+{number}" for number, _ in enumerate(STEPS[:9], 1)
+    assert [keys[f"step_{step.key}"] for step in STEPS[:10]] == [
+        f"Ctrl+{number % 10}" for number, _ in enumerate(STEPS[:10], 1)
     ]

@@ -60,7 +60,7 @@ def levels(file: Path) -> np.ndarray:
 
 
 def pictures_of(taken: tuple[Path, str, Path], part: str) -> list[Path]:
-    return sorted(taken[0].glob(f"[0-9][0-9]-{part}.png"))
+    return sorted(taken[0].glob(f"[0-9][0-9][0-9]-{part}.png"))
 
 
 @pytest.mark.soak
@@ -69,9 +69,9 @@ def test_pictures_have_the_requested_size_and_are_not_blank(
     taken: tuple[Path, str, Path],
 ):
     out, stdout, _ = taken
-    names = [line.split()[0] for line in stdout.splitlines() if re.match(r"\d\d-\S+\.png", line)]
+    names = [line.split()[0] for line in stdout.splitlines() if re.match(r"\d{3}-\S+\.png", line)]
     assert names == sorted(path.name for path in out.iterdir())
-    assert [int(name[:2]) for name in names] == list(range(1, len(names) + 1))
+    assert [int(name[:3]) for name in names] == list(range(1, len(names) + 1))
     for name in names:
         picture = levels(out / name)
         assert picture.shape == SIZE[::-1], name

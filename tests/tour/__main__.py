@@ -102,7 +102,7 @@ def _make_room(out: Path) -> None:
     """Create the folder, and delete the pictures of an earlier tour."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for picture in out.glob("[0-9][0-9]-*.png"):
+        for picture in out.glob("[0-9][0-9][0-9]-*.png"):
             picture.unlink()
     except OSError as error:
         raise InputError(out, "--out", error.strerror, "a folder that can be written") from error

@@ -304,7 +304,7 @@ class Hands:
         self.count += 1
         self.pages.add(self.page)
         part = name if name.startswith("dialog-") else "-".join(filter(None, (self.page, name)))
-        file = self.out / f"{self.count:02d}-{part}.png"
+        file = self.out / f"{self.count:03d}-{part}.png"
         same = self.pictures.setdefault(sha256(image.constBits()).digest(), file.name)
         if same != file.name:
             raise self.fail(f"{file.name} would show the same as {same}")

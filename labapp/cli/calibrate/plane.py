@@ -86,7 +86,7 @@ def _calibrated(
         The calibration, and (rows, columns) of the first picture.
     """
     from labapp.config.setup import A_SETUP
-    from labapp.config.setup_text import lens_of
+    from labapp.config.setup_text import check_lens, lens_of
     from labapp.config.toml_keys import read_text
     from labapp.core.calibration.boards import A_BOARD, parse_board
     from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
@@ -101,7 +101,9 @@ def _calibrated(
         raise InputError("--board", "board", f"{board} ({error})", A_BOARD) from error
     lens = None
     if setup is not None and setup.is_file():
-        lens = lens_of(read_text(setup, A_SETUP))
+        text = read_text(setup, A_SETUP)
+        check_lens(text, setup)
+        lens = lens_of(text)
     settings = PlaneCalibrationSettings(unit_mm=unit_mm)
     try:
         return calibrate_imaging_plane(pictures, settings, named, lens), pictures[0].shape

@@ -15,6 +15,7 @@ from labapp.cli.session.correct import InOrder, correct
 from labapp.cli.session.info import info
 from labapp.cli.shared import (
     ABOUT_SCHEMES,
+    ALGORITHM_HELP,
     DETECTOR_HELP,
     FRAMES_HELP,
     FRAMES_METAVAR,
@@ -238,7 +239,7 @@ def measure(
     ] = None,
     algorithm: Annotated[
         Algorithm | None,
-        typer.Option(help="From now on: algorithm of IRS; not used by the other schemes."),
+        typer.Option(help=f"From now on: {ALGORITHM_HELP}"),
     ] = None,
     correspondence: Annotated[
         Literal["auto", "S/S", "S/I", "I/I"] | None,

@@ -44,7 +44,8 @@ class Scheme:
     about
         Description for the help of the command line.
     words
-        Display names; for a scheme with several algorithms, those of each algorithm.
+        Display names; for a scheme with several algorithms, those of each algorithm, the default
+        first. Such a scheme has settings with a field ``algorithm``.
     settings
         Name of the class of its settings, in its module; stored in session files, so it must never
         change. Empty: it has none.
@@ -59,6 +60,10 @@ class Scheme:
     def algorithms(self) -> tuple[str, ...]:
         """Names of its algorithms; empty if it has only one."""
         return () if isinstance(self.words, Words) else tuple(self.words)
+
+    def algorithm(self, chosen: str) -> str:
+        """Return the chosen algorithm, or the first if it has not that one; empty without any."""
+        return chosen if chosen in self.algorithms else next(iter(self.algorithms), "")
 
     @property
     def settings_class(self) -> Any:
@@ -112,6 +117,11 @@ SCHEMES: dict[str, Scheme] = {
     )
 }
 """All schemes by name, in the order in which they are offered."""
+
+
+def algorithm_names() -> tuple[str, ...]:
+    """Names of the algorithms of all schemes, each once."""
+    return tuple(dict.fromkeys(name for one in SCHEMES.values() for name in one.algorithms))
 
 
 def scheme_words() -> dict[str, Words]:

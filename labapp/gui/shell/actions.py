@@ -240,7 +240,7 @@ STEP_ACTIONS = (
         Action(
             f"step_{step.key}",
             step.title,
-            f"Ctrl+{number}" if number < 10 else "",
+            f"Ctrl+{number % 10}" if number <= 10 else "",
             step.hint,
             needs="session",
         )

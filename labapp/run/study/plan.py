@@ -35,7 +35,7 @@ from labapp.config.settings import check_algorithm
 from labapp.config.setup import read_setup
 from labapp.config.toml_keys import Rule, check_keys, is_number, parse_toml, shown, unknown_key
 from labapp.core.pipeline import Settings
-from labapp.core.schemes import SCHEMES
+from labapp.core.schemes import SCHEMES, algorithm_names
 from labapp.errors import InputError, os_errors_as_input
 from labapp.export.tables import TABLES
 from labapp.files import as_bytes, relative_path, write_file
@@ -126,7 +126,7 @@ DEFAULTS: dict[str, Rule] = {
     "setup": _text(4096),
     "frames": _text(),
     "scheme": _one_of(tuple(SCHEMES)),
-    "algorithm": _one_of(tuple(name for one in SCHEMES.values() for name in one.algorithms)),
+    "algorithm": _one_of(algorithm_names()),
     "correspondence": _one_of(("auto", "S/S", "S/I", "I/I")),
     "warm": Rule("true or false", lambda value: isinstance(value, bool), required=False),
 }

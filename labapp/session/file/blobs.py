@@ -225,6 +225,8 @@ class _Reader:
             return {key: self.read(item) for key, item in held}
         if kind in SURFACES:
             return self._surface(kind, self.read(held))
+        if kind not in STORED:
+            raise ValueError(f"it was written by a labapp with other settings or schemes: {kind!r}")
         stored = STORED[kind]
         fields = {
             stored.renamed.get(name, name): self.read(item)

@@ -35,7 +35,7 @@ from labapp.core.pipeline import Measurement, Settings
 from labapp.core.recording.residual_check import ResidualSuspect, SetupVerdict
 from labapp.core.rows import find_lattice, lattice, lattice_growth, row_search
 from labapp.core.rows.correction import Correction
-from labapp.core.schemes import SCHEMES
+from labapp.core.schemes import SCHEMES, algorithm_names
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
@@ -74,7 +74,13 @@ class Stored:
 
 
 def _scheme_is_known(value: Any) -> bool:
-    return value.scheme in SCHEMES
+    if value.scheme not in SCHEMES:
+        raise ValueError(f"it was written by a labapp with other schemes: {value.scheme!r}")
+    return True
+
+
+def _choices_are_known(value: Any) -> bool:
+    return _scheme_is_known(value) and value.algorithm in algorithm_names()
 
 
 def _measurement_fits(value: Any) -> bool:
@@ -180,7 +186,7 @@ STORED = {
         Signals, shapes=dict.fromkeys(("time_s", "current_a", "voltage_v", "wire_m_min"), "n")
     ),
     # Settings
-    "Settings": Stored(Settings, fits=_scheme_is_known),
+    "Settings": Stored(Settings, fits=_choices_are_known),
     "DotSettings": Stored(find_dots.DotSettings),
     "BandPassSettings": Stored(dots.BandPassSettings),
     "BlockThresholdSettings": Stored(threshold_dots.BlockThresholdSettings),

@@ -441,5 +441,5 @@ def _differences(now: Basis | None, then: Basis) -> tuple[str, ...]:
 
 def scheme_name(settings: Settings) -> str:
     """Return the name of the scheme, with the algorithm if it has several: ``irs-opa``."""
-    several = SCHEMES[settings.scheme].algorithms
-    return f"{settings.scheme}-{settings.algorithm}" if several else settings.scheme
+    algorithm = SCHEMES[settings.scheme].algorithm(settings.algorithm)
+    return f"{settings.scheme}-{algorithm}" if algorithm else settings.scheme

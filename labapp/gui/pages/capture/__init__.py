@@ -1,1 +1,1 @@
-"""Step 4: the recording or camera that provides the frames."""
+"""The recording or camera that provides the frames."""

@@ -1,1 +1,1 @@
-"""Step 5: the dots of a frame, their rows, and corrections by hand."""
+"""The dots of a frame, their rows, and corrections by hand."""

@@ -54,7 +54,7 @@ class Command(NamedTuple):
 
 
 class DotsPage(Page):
-    """Step 5: display of the detected dots, and correction by hand."""
+    """Display of the detected dots, and correction by hand."""
 
     key = "dots"
 

@@ -1,1 +1,1 @@
-"""Step 8: export of results."""
+"""Export of results."""

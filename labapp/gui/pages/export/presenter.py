@@ -12,16 +12,17 @@ from threadpoolctl import threadpool_limits
 from labapp.core.schemes import scheme_words
 from labapp.core.values import FloatArray, IntArray
 from labapp.export.folder import (
-    FILM_FILE,
-    MANIFEST,
-    TREND_FILE,
     ExportChoice,
     ExportedFile,
     verify_export,
 )
 from labapp.export.formats import (
+    FILM_FILE,
+    MANIFEST,
+    REPORT_FILE,
     RUN_FORMATS,
     SURFACE_FORMATS,
+    TREND_FILE,
     RunFormat,
     SurfaceFormat,
     mesh_formats,
@@ -36,7 +37,6 @@ from labapp.session.results.measured import SETUP_CHANGED, scheme_name
 from labapp.session.session import Session
 from labapp.text import format_bytes, marked_setup_words, pluralize
 
-REPORT_FILE = "report.pdf"
 MANIFEST_LINE = f"{MANIFEST}: source, set-up, versions, every file with its SHA-256"
 
 LINES = "Lines are exported as their tables; the choices are for patterns of dots."

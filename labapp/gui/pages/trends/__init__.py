@@ -1,1 +1,1 @@
-"""Step 7: changes of the pool over the recording."""
+"""Changes of the pool over the recording."""
