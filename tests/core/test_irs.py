@@ -16,7 +16,7 @@ from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import caps_8_3_1, egg, spherical_cap
-from labapp.studies.error_analysis import aside
+from labapp.studies.error_analysis import off_centre
 
 RIG = Rig(
     Laser(31.14, 31.48),
@@ -51,7 +51,7 @@ def without(match, removed):
 def test_depths_of_the_caps(algorithm, median):
     settings = irs.IrsSettings(algorithm=algorithm, boundary="circle")
     error = []
-    for cap in aside(caps_8_3_1(), 1):
+    for cap in off_centre(caps_8_3_1(), 1):
         match = match_of(cap)
         measures = measure_surface(irs.reconstruct(match, RIG, settings), match, RIG)
         depth = measures.height_mm if cap.peak_mm > 0 else -measures.depth_mm

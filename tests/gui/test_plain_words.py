@@ -16,6 +16,7 @@ from PySide6.QtWidgets import QAbstractItemView, QComboBox, QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
 import labapp.gui
+from labapp.gui.shell.steps import STEPS
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.labels import plain_label, plain_tip
 from labapp.session.file.blobs import pack
@@ -99,7 +100,7 @@ def test_texts_of_a_session_are_not_rendered_as_html(window: MainWindow, evil: P
     assert window.files.open(evil)
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     counts: dict[str, int] = {}
-    for step in window._steps:
+    for step in STEPS:
         window.show_step(step.key)
         window.workspace.show_frame(0)
         qtbot.waitUntil(lambda: not window.workspace.tasks.active)

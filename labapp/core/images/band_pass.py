@@ -33,6 +33,8 @@ from labapp.core.images.filters import (
     pairs,
     peak_disc,
     scratch,
+    smaller_blurred,
+    widen,
     without_spikes,
 )
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
@@ -51,12 +53,6 @@ brightness; residues of hot pixels are fainter."""
 FAINT_SIGMA = 3.0
 """Threshold, in noise σ above the background, for a peak that the operator points at: half of that
 for other peaks (`BandPassSettings.threshold`)."""
-
-ROUND_PX2 = 0.25
-"""Variance that downsampling and upsampling add, px² of the downsampled picture."""
-
-LEAST_PX2 = 0.8
-"""Least variance of a blur that is computed on a downsampled picture, px² of that picture."""
 
 CENTROID_WIDENING = 1.4
 """Width of the window for centroids over that for detection. A wider window averages over more
@@ -402,30 +398,6 @@ class _BandPassed:
         left = variance / scale**2 - (1 - scale**-2) / 12
         blurred = blur(image, float(np.sqrt(left)), scratch(f"around {scale} blurred", shape))
         return blurred, AROUND_SIZES * self.size
-
-
-def widen(image: Grey, into: Grey, variance_px2: float) -> None:
-    """Blur by a Gaussian of the given variance, px², computed on a downsampled picture."""
-    cv2.resize(smaller_blurred(image, variance_px2), image.shape[::-1], dst=into)
-
-
-def smaller_blurred(image: Grey, variance_px2: float) -> Grey:
-    """Downsample an image and blur it by a Gaussian of the given variance, px² of the image.
-
-    It is not downsampled if the blur is narrow or the picture's sides are not divisible.
-    """
-    (height, width), scale = image.shape, 1
-    while (
-        variance_px2 / (2 * scale) ** 2 - ROUND_PX2 > LEAST_PX2
-        and height % (2 * scale) == width % (2 * scale) == 0
-    ):
-        scale *= 2
-    shape, variance = (height // scale, width // scale), variance_px2 / scale**2
-    small, blurred = (scratch(f"{name} {scale}", shape) for name in ("small", "small blurred"))
-    if scale > 1:
-        image = np.asarray(cv2.resize(image, shape[::-1], small, 0, 0, cv2.INTER_AREA), np.float32)
-        variance -= ROUND_PX2
-    return blur(image, float(np.sqrt(variance)), blurred)
 
 
 def _found(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Dots:

@@ -24,6 +24,12 @@ DOUBTED, CERTAIN = 1.5, 6.0
 """Least ratio of a spike's fall of light to that of a dot: next to a certain spike or a suspect
 peak, and elsewhere. The latter is large since speckle makes dots much sharper than Gaussians."""
 
+ROUND_PX2 = 0.25
+"""Variance that downsampling and upsampling add, px² of the downsampled picture."""
+
+LEAST_PX2 = 0.8
+"""Least variance of a blur that is computed on a downsampled picture, px² of that picture."""
+
 KEPT_BYTES = 2**23
 """Larger scratch pictures are not kept for the next frame."""
 
@@ -109,3 +115,27 @@ def without_spikes(
 def pairs(u: IntArray, v: IntArray) -> FloatArray:
     """Places (u, v) of pixels, shape (n, 2)."""
     return np.stack([u, v], axis=1).astype(float)
+
+
+def widen(image: Grey, into: Grey, variance_px2: float) -> None:
+    """Blur by a Gaussian of the given variance, px², computed on a downsampled picture."""
+    cv2.resize(smaller_blurred(image, variance_px2), image.shape[::-1], dst=into)
+
+
+def smaller_blurred(image: Grey, variance_px2: float) -> Grey:
+    """Downsample an image and blur it by a Gaussian of the given variance, px² of the image.
+
+    It is not downsampled if the blur is narrow or the picture's sides are not divisible.
+    """
+    (height, width), scale = image.shape, 1
+    while (
+        variance_px2 / (2 * scale) ** 2 - ROUND_PX2 > LEAST_PX2
+        and height % (2 * scale) == width % (2 * scale) == 0
+    ):
+        scale *= 2
+    shape, variance = (height // scale, width // scale), variance_px2 / scale**2
+    small, blurred = (scratch(f"{name} {scale}", shape) for name in ("small", "small blurred"))
+    if scale > 1:
+        image = np.asarray(cv2.resize(image, shape[::-1], small, 0, 0, cv2.INTER_AREA), np.float32)
+        variance -= ROUND_PX2
+    return blur(image, float(np.sqrt(variance)), blurred)
