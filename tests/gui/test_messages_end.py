@@ -105,7 +105,7 @@ def test_pending_click_ends_with_the_session(
     opened.show_step("dots")
     qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
     assert "Click where" not in page.dots_panel.chosen.text()
-    assert not page.hand.busy
+    assert not page.dot_tool.busy
 
 
 def test_incomplete_setup_message_ends_after_measuring(opened: MainWindow, tmp_path: Path):

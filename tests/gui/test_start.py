@@ -32,7 +32,7 @@ print(*sys.modules)
 SURFACE_PAGE = """
 import sys
 import labapp.session.session
-import labapp.gui.pages.surface
+import labapp.gui.pages.surface.page
 print(*sys.modules)
 """
 
