@@ -61,8 +61,14 @@ def now() -> str:
 
 
 def local_time(iso: str) -> str:
-    """Return an ISO 8601 time as local date and time, to the minute: "2024-05-01 10:00"."""
-    return f"{datetime.fromisoformat(iso).astimezone():%Y-%m-%d %H:%M}"
+    """Return an ISO 8601 time as local date and time, to the minute: "2024-05-01 10:00".
+
+    Another text, which a file of somebody else may contain, is returned as it is.
+    """
+    try:
+        return f"{datetime.fromisoformat(iso).astimezone():%Y-%m-%d %H:%M}"
+    except (ValueError, OverflowError, OSError):  # the latter two for years beyond the calendar
+        return iso
 
 
 def pluralize(count: int, noun: str) -> str:

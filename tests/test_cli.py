@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -490,6 +491,20 @@ def test_samples_reject_a_folder_that_cannot_be_written(labapp: Run, tmp_path: P
     code, _, stderr = labapp("samples", tmp_path / "file" / "new")
     assert code == 2
     assert "expected one that can be written" in stderr
+
+
+def test_samples_report_the_first_file_that_cannot_be_copied(
+    labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise shutil.Error([("a", "b", "no space left"), ("c", "d", "no space either")])
+
+    monkeypatch.setattr(shutil, "copytree", fail)
+    code, _, stderr = labapp("samples", tmp_path / "new")
+    assert code == 2
+    assert stderr.count("\n") == 1
+    assert "no space left; expected" in stderr
+    assert "either" not in stderr
 
 
 def test_demo_measures_the_sample_recording(

@@ -43,6 +43,11 @@ def test_time_is_shown_in_the_local_time_zone_to_the_minute(iso: str) -> None:
     assert local_time(here.isoformat()) == local_time(iso)
 
 
+@pytest.mark.parametrize("text", ["yes", "", "0001-01-01T00:00:00+14:00"])
+def test_a_time_that_cannot_be_read_is_shown_as_it_is(text: str) -> None:
+    assert local_time(text) == text
+
+
 @pytest.mark.parametrize(
     ("name", "words", "unit"),
     [

@@ -17,6 +17,8 @@ from labapp.cli.shared import (
 from labapp.cli.window import show_in_app
 from labapp.errors import InputError, os_errors_as_input
 
+WRITABLE = "one that can be written"
+
 
 def samples(
     folder: Annotated[Path, typer.Argument(help="Destination; created if missing.")],
@@ -33,8 +35,11 @@ def samples(
         if (folder / name).exists():
             raise InputError(folder, "folder", f"it has {name}", "a folder without it")
     for name in ("sample_sessions", "resources"):
-        with os_errors_as_input(folder, "folder", "one that can be written"):
-            shutil.copytree(bundled(name), folder / name, ignore=shutil.ignore_patterns(".*"))
+        with os_errors_as_input(folder, "folder", WRITABLE):
+            try:
+                shutil.copytree(bundled(name), folder / name, ignore=shutil.ignore_patterns(".*"))
+            except shutil.Error as error:  # of several files: (source, target, reason) of each
+                raise InputError(folder, "folder", error.args[0][0][2], WRITABLE) from error
     typer.echo(f"sample_sessions and resources are in {folder}")
 
 

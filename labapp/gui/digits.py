@@ -101,7 +101,8 @@ def as_csv(rows: Iterable[ResultRow]) -> str:
 def round_factor(most: float) -> float:
     """The largest 1, 2 or 5 times a power of ten that does not exceed ``most`` (positive)."""
     power: float = 10.0 ** math.floor(math.log10(most))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most)
+    # log10 may round up to the next power.
+    return max((step * power for step in (1.0, 2.0, 5.0) if step * power <= most), default=power)
 
 
 def cell_text(cell: str | float | None) -> str:

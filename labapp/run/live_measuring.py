@@ -110,8 +110,8 @@ class LiveChain:
 
     def _quality(self, frame: CameraFrame, found: Measurement) -> Quality:
         """Return the quality of the frame, or a recent one: it takes half as long as measuring."""
-        now_s, is_followed = time.monotonic(), self._chain.track_lost is None
-        if self._judged is not None and is_followed and now_s < self._judged[0] + JUDGED_S:
+        now_s, is_tracked = time.monotonic(), self._chain.track_lost is None
+        if self._judged is not None and is_tracked and now_s < self._judged[0] + JUDGED_S:
             return self._judged[1]
         quality = judge_quality(frame.image, found, self._bit_depth, self._rays)
         self._judged = now_s, quality

@@ -105,8 +105,8 @@ class LiveWatch:
             if not self._is_closed:
                 self._raise_silence(f"Nothing is measured any more: {error}")
             raise
-        is_followed = result is not None and result.track_lost is None
-        self.queue.done(is_followed, time.monotonic() - began_s)
+        is_tracked = result is not None and result.track_lost is None
+        self.queue.done(is_tracked, time.monotonic() - began_s)
         if result is not None:
             for sink in self._sinks:
                 sink(result)

@@ -408,7 +408,7 @@ class RecordingMeasurer:
 
 def _first_batch(measurer: RecordingMeasurer, frames: Sequence[int]) -> list[FrameResult]:
     """Begin a stretch in this process, and end the previous one."""
-    if (previous := held()) is not None:
+    if isinstance(previous := held(), Generator):
         previous.close()
     cv2.setNumThreads(1)
     hold(measurer, frames)

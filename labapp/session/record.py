@@ -109,7 +109,7 @@ class MirrorPicture(ReadOnlyArrays):
     (`MeasuredSize.independent_mm`), and its standard uncertainty, mm; empty in older files.
     """
     pose_sigma: tuple[tuple[str, float], ...] = ()
-    """Given standard uncertainty of each parameter of the mirror's pose (`Mirror.parameters`), by
+    """Given standard uncertainty of each parameter of the mirror's pose (`Plate.parameters`), by
     name; empty in older files.
     """
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
@@ -131,6 +132,26 @@ def test_frequency_through_missing_frames():
     frequency, share = oscillation_frequency(time_s[known], values[known])
     assert frequency == pytest.approx(37.3, abs=0.1)
     assert share > 0.5
+
+
+def test_share_of_the_variance_is_that_of_the_periodogram_with_a_free_mean():
+    rng = np.random.default_rng(11)
+    time_s = np.sort(rng.uniform(0.0, 0.4, 240))
+    values = np.sin(2 * np.pi * 41.0 * time_s) + 0.3 * rng.normal(size=240)
+    frequency, share = oscillation_frequency(time_s, values)
+    drift = np.polynomial.Polynomial.fit(time_s, values, 3)(time_s)
+    rates = np.arange(5.0, 100.0, 1 / (8 * np.ptp(time_s)))  # eight per inverse of the duration
+    expected = scipy.signal.lombscargle(
+        time_s, values - drift, 2 * np.pi * rates, normalize=True, floating_mean=True
+    )
+    assert frequency == pytest.approx(41.0, abs=0.1)
+    assert share == pytest.approx(expected.max(), rel=1e-9)
+
+
+def test_a_line_at_rest_has_no_frequency():
+    frequency, share = oscillation_frequency(np.arange(100) / 1500, np.zeros(100))
+    assert np.isnan(frequency)
+    assert share == 0.0
 
 
 def test_frequency_of_a_long_recording_needs_little_memory():

@@ -166,8 +166,8 @@ def test_corrected_rows_are_binding() -> None:
     assert statuses(measured) == ["ok"] * 4
 
 
-def test_followed_frames_share_the_rows_of_the_first() -> None:
-    """Followed frames have no vote of their own."""
+def test_tracked_frames_share_the_rows_of_the_first() -> None:
+    """Tracked frames have no vote of their own."""
     right = frames(8)
     measured = [slipped(each, (1, 0)) if 3 <= k < 7 else each for k, each in enumerate(right)]
     vote = RowVote(BENCH_RIG, SETTINGS)

@@ -230,6 +230,13 @@ def test_keys_move_through_frames_and_steps(
     assert plain_page(plain).key == "surface"
 
 
+def test_a_key_of_no_step_shows_nothing_new(plain: MainWindow, copy_sample: CopySample):
+    plain.files.open(copy_sample("blocked_rows"))
+    before = plain.page
+    plain.show_step("")
+    assert plain.page is before
+
+
 def test_space_plays_and_arrow_keys_in_a_field_keep_the_frame(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):

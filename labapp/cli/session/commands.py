@@ -44,7 +44,7 @@ from labapp.core.schemes import scheme_words
 from labapp.errors import InputError
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS
 from labapp.session.results.statuses import is_measured
-from labapp.text import now, pluralize
+from labapp.text import local_time, now, pluralize
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings
@@ -443,7 +443,7 @@ def checklist(
             typer.echo(f"{name}: {sum(item in times for item, _ in some)} of {len(some)}")
             for item, meaning in some:
                 number += 1
-                mark = f"ticked {times[item][:16].replace('T', ' ')}" if item in times else ""
+                mark = f"ticked {local_time(times[item])}" if item in times else ""
                 typer.echo(f"{number:3} {'[x]' if mark else '[ ]'} {item}  {mark}".rstrip())
                 typer.echo(f"        {meaning}")
 

@@ -1,6 +1,6 @@
 """Assignment of rays to the dots in a picture of a mirror.
 
-The rows and columns in the picture and the hole of the absent ray determine the rays of a grid
+The rows and columns in the picture and the hole of the absent ray determine the rays of a lattice
 directly, however wrong the set-up is. Bench and mirror are adjusted to these labels and predict the
 dot of every ray. Each dot close to a predicted one is assigned to its ray. This is repeated until
 no label changes.
@@ -139,7 +139,7 @@ def label_picture(
         )
     observed = Observation.of(picture.dots, Bench(rig, calibration), picture.frame_shape)
     found: list[Labelled] = []
-    for first in (_by_grid, _by_places):
+    for first in (_by_lattice, _by_places):
         starts = _likeliest(first(observed, picture), observed)
         grown = (_grown(observed, picture.mirror, freed, one) for one in starts)
         found += [one for one in grown if one is not None]
@@ -173,7 +173,7 @@ def _likeliest(starts: list[IntArray], observed: Observation) -> list[IntArray]:
     return [starts[k] for k in order if penalties[k] <= penalties.min() + MOST_WORSE]
 
 
-def _by_grid(observed: Observation, picture: MirrorDots) -> list[IntArray]:
+def _by_lattice(observed: Observation, picture: MirrorDots) -> list[IntArray]:
     """Labels from the rows and columns in the picture, for the absent ray at each empty site."""
     pattern = observed.rig.pattern
     try:

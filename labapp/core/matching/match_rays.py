@@ -74,7 +74,7 @@ from labapp.core.matching.unexplained import (
     explains_half,
     suffices,
 )
-from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_sites
+from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_dots
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
 from labapp.core.surface.spline import SplineSurface
@@ -111,10 +111,10 @@ def match_rays(
     ------
     CannotMeasure
         ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``too-many-dots`` if most could
-    have no ray even if every ray made one; ``no-reference`` if the pattern has no absent ray or
-    no hole can be the absent dot; ``ambiguous-rows`` if a dot lies in the only hole, or a part
-    of the rows can be shifted; ``ambiguous-orientation``; ``no-match`` if no surface explains
-    the dots.
+        have no ray even if every ray made one; ``no-reference`` if the pattern has no absent ray or
+        no hole can be the absent dot; ``ambiguous-rows`` if a dot lies in the only hole, or a part
+        of the rows can be shifted; ``ambiguous-orientation``; ``no-match`` if no surface explains
+        the dots.
     RowsOpen
         ``ambiguous-rows`` if several holes can be the absent dot, perhaps with a set-up that is
         wrong within its uncertainty. Other frames of the recording may decide between them.
@@ -208,9 +208,7 @@ def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:
     """
     way, marker = ways(match.orientation), rig.pattern.marker or rig.pattern.center_ray
     k, t = np.array(marker) * way + (match.reflected - match.ray * way)[0]
-    pairs = np.column_stack([match.reflected, match.dot]).tolist()
-    dot_at = {(row, column): dot for row, column, dot in pairs}
-    return lattice_of_sites(dot_at, count, (int(k), int(t)))
+    return lattice_of_dots(match.reflected, match.dot, count, (int(k), int(t)))
 
 
 def _by_lattice(

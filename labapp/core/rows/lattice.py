@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -53,11 +52,22 @@ def lattice_of_sites(
     candidates: tuple[Site, ...] = (),
 ) -> Lattice:
     """Build the lattice of ``count`` dots from a mapping of sites (k, t), from 1, to dots."""
-    row, column = np.zeros(count, np.int64), np.zeros(count, np.int64)
-    dots = list(dot_at.values())
-    row[dots], column[dots] = np.array(list(dot_at), np.int64).reshape(-1, 2).T
+    sites = np.array(list(dot_at), np.int64).reshape(-1, 2)
+    return lattice_of_dots(sites, list(dot_at.values()), count, reference, candidates)
+
+
+def lattice_of_dots(
+    sites: IntArray,
+    dots: IntArray | list[int],
+    count: int,
+    reference: Site | None = None,
+    candidates: tuple[Site, ...] = (),
+) -> Lattice:
+    """Build the lattice of ``count`` dots from the sites (k, t) of m of them, shape (m, 2)."""
+    row, column = np.zeros((2, count), np.int64)
+    row[dots], column[dots] = sites.T
     candidates = candidates or ((reference,) if reference else ())
-    return Lattice(row, column, reference, candidates, _blocked_rows(dot_at))
+    return Lattice(row, column, reference, candidates, _blocked_rows(sites))
 
 
 def find_holes(dot_at: dict[Site, int], dots: Dots) -> list[tuple[Site, int]]:
@@ -88,11 +98,7 @@ def empty_sites(lattice: Lattice) -> list[Site]:
     return sorted({(k + dk, t + dt) for k, t in taken for dk, dt in _NEXT} - taken)
 
 
-def _blocked_rows(dot_at: dict[Site, int]) -> frozenset[int]:
+def _blocked_rows(sites: IntArray) -> frozenset[int]:
     """Rows that lack two or more adjacent dots between others: hidden by the torch."""
-    rows: dict[int, list[int]] = {}
-    for k, t in dot_at:
-        rows.setdefault(k, []).append(t)
-    return frozenset(
-        k for k, ts in rows.items() if any(t - before > 2 for before, t in pairwise(sorted(ts)))
-    )
+    k, t = sites[np.lexsort(sites.T[::-1])].T
+    return frozenset(k[1:][(np.diff(k) == 0) & (np.diff(t) > 2)].tolist())

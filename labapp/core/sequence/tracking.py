@@ -3,8 +3,8 @@
 The surface is extrapolated from its oscillation (`prior.predictions`). If no prediction finds the
 dots, as at the start, they are tracked from the absent one outwards, ring by ring. The tracked dots
 keep their rays; dots next to them get theirs from the surface fitted to the tracked ones. The
-result is accepted only if the absent ray is dark between lit ones, and if no more is left
-unexplained than would be accepted without a prior.
+result is accepted only if the hole of the absent ray is empty, between lit rays, and if no more is
+left unexplained than would be accepted without a prior.
 
 As in `match_rays`, a dot whose ray is ambiguous gets none.
 """
@@ -435,9 +435,9 @@ def _reference_is_seen(observed: Observation, paths: RayPaths, off: float) -> bo
         raise TrackLost("the absent ray is at the pool's edge")
     reach = min(np.linalg.norm(plane[1] - plane[2]), np.linalg.norm(plane[3] - plane[4])) / 2
     between = observed.plane_mm - plane[:, None]
-    dark = np.linalg.norm(between, axis=-1).min(axis=1) > reach / 2
-    if not dark[0]:
-        raise TrackLost("a dot is where the absent one should be dark")
-    if sum(dark[1:]) > (2 if off < PREDICTED else 0):
+    empty = np.linalg.norm(between, axis=-1).min(axis=1) > reach / 2
+    if not empty[0]:
+        raise TrackLost("a dot is in the hole of the absent one")
+    if sum(empty[1:]) > (2 if off < PREDICTED else 0):
         raise TrackLost("the dots beside the absent one are not seen")
-    return not dark[1:].any()
+    return not empty[1:].any()

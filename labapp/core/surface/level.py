@@ -7,7 +7,8 @@ pool's rear, which may lie below it (§7.2).
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -37,7 +38,7 @@ class Rear:
     @property
     def as_array(self) -> FloatArray:
         """Drop, start and end as an array for compiled functions, shape (3,), mm."""
-        return np.array(astuple(self), float)
+        return np.array([self.drop_mm, self.start_mm, self.end_mm], float)
 
     def height(self, y_mm: FloatArray) -> FloatArray:
         """Height of the boundary at y, of the shape of ``y_mm``, mm.
@@ -90,8 +91,12 @@ class Level:
     @property
     def as_array(self) -> FloatArray:
         """Values as an array for compiled functions (`of`), shape (11,)."""
-        shift, sigma, sign, rear, *others = astuple(self)
-        return np.array([shift, sigma, sign, *rear, *others], float)
+        rear = self.rear
+        first = self.shift_mm, self.sigma_mm, self.pool_sign
+        found = self.negative_log_likelihood, self.ray_count, self.rise_mm
+        by_drop = self.drop_sigma_mm, self.drop_covariance_mm2
+        values = (*first, rear.drop_mm, rear.start_mm, rear.end_mm, *found, *by_drop)
+        return np.array(values, float)
 
     def sigma_of(self, by_shift: FloatArray, by_drop: FloatArray) -> FloatArray:
         """Standard uncertainty of quantities due to that of the level, shape (m,).
@@ -202,7 +207,7 @@ class LevelSearch:
     level_settled_mm: float = 0.0
     outer: BoolArray | None = None
 
-    @property
+    @cached_property
     def for_kernel(self) -> tuple[_LevelInput, FloatArray, tuple[float, float, bool, bool, float]]:
         """The level's arguments of `rounds_kernels.run_rounds`, and the last five limits."""
         witnesses, near, outer = self.witnesses, self.near, self.outer

@@ -21,8 +21,8 @@ REUSE_MM = 5e-3
 with the cells of the splines."""
 
 NEWTON_STEPS = 4
-"""Steps from a reflection point to that on the surface of the next round, if the level is searched
-for among all levels: the surface may then move far."""
+"""Steps from a reflection point to that on another surface, or on that of the next round if the
+level is searched for among all levels: the surface may then move far."""
 
 NO_SURFACE = "no surface has the slopes that the dots require"
 

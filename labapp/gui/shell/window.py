@@ -210,9 +210,9 @@ class MainWindow(QMainWindow):
 
     def show_step(self, key: str) -> None:
         """Show the page of a step; it is created on first use."""
-        if self.workspace.session is None:
+        step = next((step for step in STEPS if step.key == key), None)
+        if self.workspace.session is None or step is None:
             return
-        step = next(step for step in STEPS if step.key == key)
         if key not in self.pages:
             made = self.workspace.run_or_report(lambda: make_page(step, self.workspace))
             if made is None:

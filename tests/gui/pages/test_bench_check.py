@@ -125,7 +125,6 @@ def test_check_finds_deviations_and_undetermined_quantities(checked: CheckResult
     assert ("Imaging plane", "s") in rows
     rotation = rows["Pattern", "Rotation"]
     assert rotation.texts[-1] == presenter.DETERMINED
-    assert rotation.texts[-1] == presenter.DETERMINED
     assert " ± " in rotation.texts[2]
     undetermined = {name for name, row in rows.items() if row.texts[-1] == presenter.NOT_DETERMINED}
     share = record.after_sigma[uncertain] / record.before_sigma[uncertain]

@@ -406,6 +406,16 @@ def test_rejected_edit_is_reported_and_changes_nothing(
     assert unfitted == []
 
 
+def test_nothing_to_discard_is_a_note_not_a_problem(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    show(page, qtbot, copy_sample("blocked_rows"), 0)
+    problems = []
+    page.workspace.notified.connect(lambda _, problem: problems.append(problem))
+    key(page, Qt.Key.Key_Backspace, Qt.KeyboardModifier.ControlModifier)
+    assert problems == [False]
+
+
 def test_rows_are_edited_in_the_list_by_keyboard(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:

@@ -370,7 +370,8 @@ class DotsPage(Page):
     def _run(self, command: Command) -> None:
         """Run a command, or report what it needs."""
         if command.text in self._needs and (why := self._unmet_need(command.needs)):
-            self.workspace.notified.emit(why, True)
+            is_problem = bool(self.locked) or command.needs != "corrected"
+            self.workspace.notified.emit(why, is_problem)
         else:
             command.do()
 

@@ -34,6 +34,7 @@ from labapp.export.rendering.studio import PICTURE_PX
 from labapp.gui.drafts import folder_of
 from labapp.session.frames import Progress
 from labapp.session.results.measured import SETUP_CHANGED, scheme_name
+from labapp.session.results.statuses import is_failed
 from labapp.session.session import Session
 from labapp.text import format_bytes, marked_setup_words, pluralize
 
@@ -222,11 +223,10 @@ def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
         notes.append(
             f"{pluralize(len(unmeasured), 'frame')} not measured by {_named(scheme)}: left out."
         )
-    if measured.any() and surfaces < measured.sum():
-        without = int(measured.sum()) - surfaces
-        notes.append(
-            f"{pluralize(without, 'frame')} without a surface: in the tables with the reason."
-        )
+    if failed := sum(map(is_failed, status[measured])):
+        why = "without a surface: in the tables with the reason"
+        words = "that could not be measured: left out" if locked else why
+        notes.append(f"{pluralize(failed, 'frame')} {words}.")
     if "film" in request.some("pictures") and surfaces:
         notes.append(film_note(seen.frame[measured], seen.time_s[measured], request.film_rate_hz))
     frames = seen.frame[measured]
