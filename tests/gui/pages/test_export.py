@@ -241,7 +241,7 @@ def test_frames_of_a_followed_line_are_not_called_failed(copy_sample) -> None:
     with Session.open(copy_sample("gmaw"), read_only=True) as session:
         assert len(session.overview().frame) == 96
         notes = plan(session, ExportRequest(), 0).notes
-    assert not any("could not be measured" in note for note in notes)
+    assert not any("could not" in note or "without" in note for note in notes)
 
 
 def test_choices_are_locked_for_lines(page: ExportPage, copy_sample) -> None:
