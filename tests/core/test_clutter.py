@@ -9,10 +9,11 @@ import pytest
 from labapp.config.setup import parse_setup
 from labapp.core.geometry.bench import Bench
 from labapp.core.matching import unexplained
-from labapp.core.matching.hypothesis import evaluate
+from labapp.core.matching.free_setup import with_setup_free
+from labapp.core.matching.hypothesis import FINE_FIT, evaluate, evaluate_averaged
 from labapp.core.matching.observation import Observation
 from tests.benchmarks import clutter_recordings, rendered
-from tests.benchmarks.clutter import draw, with_setup_errors
+from tests.benchmarks.clutter import as_entered, draw, with_setup_errors
 from tests.benchmarks.dips import PoolResult, measure_pool
 from tests.core.test_dips import true_labels
 from tests.scenes import BENCH_VIEW, FRAME_SHAPE
@@ -72,6 +73,19 @@ def test_slight_preference_of_knots_for_rows_does_not_decide(kind: str, seed: in
 def test_holes_ambiguous_within_setup_uncertainty_are_rejected(kind: str, seed: int) -> None:
     """With the setup assumed exact, every label was a row or a column off."""
     assert result_with_setup_errors(kind, seed).status == "ambiguous-rows"
+
+
+def test_free_setup_costs_no_more_than_the_entered_one() -> None:
+    """The step to another set-up lowers residuals, but may raise the other parts of the cost."""
+    rig, seen, _ = draw("dented", 12019, 0.0, 0)
+    bench = Bench(as_entered(rig, BENCH_VIEW), BENCH_VIEW)
+    observed = Observation.of(seen.dots, bench, FRAME_SHAPE)
+    right = evaluate(observed, true_labels(seen), FINE_FIT)
+    assert right is not None
+    entered = evaluate_averaged(observed, right.labels, FINE_FIT, right.pool)
+    assert entered is not None
+    free = with_setup_free(observed, right, FINE_FIT)
+    assert free.cost <= free.given_cost <= entered.cost + 0.01
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("cap", 5000), ("egg", 5001), ("concave", 5005)])

@@ -108,9 +108,10 @@ def with_setup_free(
 ) -> FreeHypothesis:
     """Evaluate labels with the set-up with which they are likeliest.
 
-    That set-up is found by one Gauss–Newton step, which minimises the sum of the squared residuals
-    and squared deviations of the set-up, both in σ, while the surface is refitted. Costs are
-    infinite without a surface, and if the cost of the given labels is not below ``most``.
+    One Gauss–Newton step minimises the sum of the squared residuals and squared deviations of the
+    set-up, both in σ, while the surface is refitted. It disregards the other parts of the cost: if
+    these increase by more, the set-up stays as entered. Costs are infinite without a surface, and
+    if the cost of the given labels is not below ``most``.
     """
     labels, uncertainty = hypothesis.labels, observed.rig.uncertainty
     pool = try_fit(observed, labels, USUAL_FIT, hypothesis.pool)
@@ -129,15 +130,16 @@ def with_setup_free(
     deviation = np.linalg.solve(jacobian.T @ jacobian + np.eye(len(rhs)), rhs)
     rig, plane_mm = perturbed(observed.rig, uncertainty.root @ deviation, observed.plane_mm)
     moved = replace(observed, bench=Bench(rig, observed.bench.calibration), plane_mm=plane_mm)
-    found, setup_cost = (
-        evaluate_averaged(moved, labels, fit_settings, pool),
-        float(deviation @ deviation),
-    )
-    if found is None or found.cost + setup_cost >= most:
+    setup_cost = float(deviation @ deviation)
+    entered = evaluate_averaged(observed, labels, fit_settings, pool)
+    found = evaluate_averaged(moved, labels, fit_settings, pool)
+    if found is None or entered is None:
+        return FreeHypothesis(labels)
+    given_cost = min(found.cost + setup_cost, entered.cost)
+    if given_cost >= most:
         return FreeHypothesis(labels)
     more = grow_and_evaluate(moved, labels)
     grown = more and evaluate_averaged(moved, more.labels, fit_settings, more.pool)
-    least = grown if grown and grown.cost < found.cost else found
-    return FreeHypothesis(
-        least.labels, given_cost=found.cost + setup_cost, cost=least.cost + setup_cost
-    )
+    if grown and grown.cost + setup_cost < given_cost:
+        return FreeHypothesis(grown.labels, given_cost=given_cost, cost=grown.cost + setup_cost)
+    return FreeHypothesis(labels, given_cost=given_cost, cost=given_cost)
