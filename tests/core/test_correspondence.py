@@ -529,7 +529,7 @@ def test_too_few_rows_or_wrong_orientation_is_rejected() -> None:
 
 def test_more_dots_than_any_match_can_explain_are_rejected_before_the_search() -> None:
     rng, rays = np.random.default_rng(3), BENCH_RIG.pattern.rows * BENCH_RIG.pattern.columns
-    dots = as_dots(rng.uniform(0, FRAME_SHAPE[::-1], (2 * rays + 1, 2)), 0.1)
+    dots = as_dots(rng.uniform(0, FRAME_SHAPE[::-1], (int(1.4 * rays), 2)), 0.1)
     with pytest.raises(CannotMeasure, match=f"too-many-dots: {len(dots)} spots .* {rays} dots"):
         match_rays(dots, None, Bench(BENCH_RIG, BENCH_VIEW), FRAME_SHAPE, MatchSettings())
 

@@ -68,7 +68,6 @@ from labapp.core.matching.repair import with_repaired, with_rows_beyond
 from labapp.core.matching.unexplained import (
     MOST_SCATTERED,
     MOST_SCATTERED_AT_LAST,
-    MOST_STRAY,
     NOTHING_EXPLAINS,
     any_explains,
     explains_half,
@@ -110,11 +109,11 @@ def match_rays(
     Raises
     ------
     CannotMeasure
-        ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``too-many-dots`` if most could
-        have no ray even if every ray made one; ``no-reference`` if the pattern has no absent ray or
-        no hole can be the absent dot; ``ambiguous-rows`` if a dot lies in the only hole, or a part
-        of the rows can be shifted; ``ambiguous-orientation``; ``no-match`` if no surface explains
-        the dots.
+        ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``too-many-dots`` if more dots than
+        are accepted would have no ray even if every ray made one; ``no-reference`` if the pattern
+        has no absent ray or no hole can be the absent dot; ``ambiguous-rows`` if a dot lies in the
+        only hole, or a part of the rows can be shifted; ``ambiguous-orientation``; ``no-match`` if
+        no surface explains the dots.
     RowsOpen
         ``ambiguous-rows`` if several holes can be the absent dot, perhaps with a set-up that is
         wrong within its uncertainty. Other frames of the recording may decide between them.
@@ -124,7 +123,7 @@ def match_rays(
             "too-few-dots", f"only {len(dots)} dots found; at least {LEAST_LABELS} are needed"
         )
     rays = bench.rig.pattern.rows * bench.rig.pattern.columns
-    if len(dots) * (1 - MOST_STRAY) > rays:
+    if len(dots) > rays + max(MOST_SCATTERED_AT_LAST * rays, settings.most_strays(len(dots))):
         # No hypothesis would be accepted, after a search that takes minutes.
         words = f"{len(dots)} spots stand out, where the lens makes {rays} dots at most"
         raise CannotMeasure("too-many-dots", words)
