@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 from labapp.core.geometry.bench import Bench
@@ -85,11 +84,6 @@ class Settings:
     irs: irs.IrsSettings = field(default_factory=irs.IrsSettings)
     zonal: zonal.ZonalSettings = field(default_factory=zonal.ZonalSettings)
     modal: modal.ModalSettings = field(default_factory=modal.ModalSettings)
-
-    @cached_property
-    def matching(self) -> MatchSettings:
-        """Settings of the matching, with the correspondence."""
-        return replace(self.match, correspondence=self.correspondence)
 
 
 @dataclass(frozen=True, repr=False)
@@ -220,20 +214,20 @@ def measure(
     )
     if (lines_rig := line_rig(bench.rig)) is not None:
         return _with_lines(result, image, lines_rig, bench), None
-    rig, match_settings, found = bench.rig, settings.matching, dict[str, Any]()
+    rig, match_settings = bench.rig, replace(settings.match, correspondence=settings.correspondence)
     frame_shape, known = (image.shape[0], image.shape[1]), None
     tracked, tuning, initial = None, None, None
     try:
         if isinstance(correction, Correction):
             dots, lattice = correction.dots, correction.lattice
-            found.update(dots=dots, lattice=lattice)
+            result = replace(result, dots=dots, lattice=lattice)
             match, initial = match_corrected(dots, lattice, bench, frame_shape, match_settings)
             lattice = lattice_of_corrected(match, rig, lattice)
         elif prior is not None:
             from labapp.core.sequence.tracking import track
 
             dots = quick_dots(_as_before(image, prior), prior.tuning, settings.dots.band_pass)
-            found.update(dots=dots)
+            result = replace(result, dots=dots)
             on_step("dots")
             observed = Observation.of(dots, bench, frame_shape)
             tracked = track(prior, observed, settings.fit, match_settings)
@@ -243,21 +237,21 @@ def measure(
             dots, tuning = _dots_and_tuning(image, settings.dots)
             on_step("dots")
             found_lattice, no_lattice = _lattice_or_why(dots, frame_shape, settings.lattice)
-            found.update(dots=dots, lattice=found_lattice)
+            result = replace(result, dots=dots, lattice=found_lattice)
             match, initial = _match_or_why(
                 dots, found_lattice, no_lattice, bench, frame_shape, match_settings
             )
             lattice = lattice_of_match(match, rig, len(dots))
-        found.update(match=match, lattice=lattice)
+        result = replace(result, match=match, lattice=lattice)
         if settings.scheme != "fit":
-            return _by_scheme(replace(result, **found), match, rig, settings), None
+            return _by_scheme(result, match, rig, settings), None
         pool = tracked.pool if tracked else fit.fit_surface(match, rig, settings.fit, initial)
         on_step("surface")
         reconstruction, measured = fit.bound_and_measure(match, pool, rig, settings.fit, known)
     except CannotMeasure as why:
-        return _refused(replace(result, **found), why), None
+        return _refused(result, why), None
     on_step("measures")
-    result = replace(result, **found, reconstruction=reconstruction, measures=measured)
+    result = replace(result, reconstruction=reconstruction, measures=measured)
     if prior is not None and tracked is not None:
         return result, prior.after(tracked, reconstruction, measured)
     from labapp.core.sequence.prior import Prior

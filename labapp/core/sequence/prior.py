@@ -13,7 +13,7 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.images.band_pass import DetectorTuning
 from labapp.core.match import Match
 from labapp.core.matching.prediction import RayPaths
-from labapp.core.schemes.fit import UNSETTLED_MM, FromPrevious, SetupPart
+from labapp.core.schemes.fit import UNSETTLED_MM, FromPrevious, SetupPart, nearest_part
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.level import Level
 from labapp.core.surface.measures import Measures
@@ -134,10 +134,9 @@ class Prior:
 
     def after(self, tracked: Tracked, made: Reconstruction, measures: Measures) -> Prior:
         """Build the prior for the frame after one that was tracked with this one."""
-        by_setup = () if self.setup_is_due else self.by_setup
-        # Not of an earlier frame: it was computed for these sizes.
-        if not any(part.sigma is made.size_sigma_setup for part in by_setup):
-            by_setup = *by_setup, SetupPart(made.size_sigma_setup, measures.sizes)
+        by_setup, sizes = () if self.setup_is_due else self.by_setup, measures.sizes
+        if nearest_part(by_setup, sizes) is None:  # it was computed for these sizes
+            by_setup = *by_setup, SetupPart(made.size_sigma_setup, sizes)
         paths, lit, pool = tracked.paths, tracked.lit, tracked.pool
         return replace(
             self,
