@@ -188,7 +188,7 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def unescaped_csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """Return rows as CSV text without escaping, for rows that were read from a CSV file."""
+    """Return rows as CSV text without escaping, for rows of numbers or from a CSV file."""
     lines = _Lines()
     csv.writer(lines).writerows(rows)
     return "".join(lines)

@@ -23,7 +23,7 @@ from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.frame_result import FrameResult
-from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, csv_text
+from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, as_cell, csv_text, unescaped_csv_text
 
 PX_DIGITS, MM_DIGITS = 4, 6
 
@@ -195,7 +195,7 @@ def _cells(result: FrameResult) -> list[Any]:
         measurement.scheme,
         "" if match is None else match.orientation,
         0 if measurement.dots is None else len(measurement.dots),
-        math.nan if lattice is None else float(len(np.unique(lattice.row[lattice.row > 0]))),
+        math.nan if lattice is None else float(len(set(lattice.row.tolist()) - {0})),
         *(getattr(measurement.measures, name, math.nan) for name in MEASURE_COLUMNS),
         sigma_of(measurement),
         measurement.reason,
@@ -207,21 +207,22 @@ def _cells(result: FrameResult) -> list[Any]:
 def sigma_of(measurement: Measurement) -> str:
     """Return the contributions to a frame's standard uncertainties; empty if it has none."""
     total, setup = (_sigmas(measurement.measures, part) for part in ("", "setup"))
-    if not np.isfinite(total).any():
+    if not any(map(math.isfinite, total)):
         return ""
-    return SIGMA_OF if np.isfinite(setup).any() else HEIGHT_SIGMA_OF
+    return SIGMA_OF if any(map(math.isfinite, setup)) else HEIGHT_SIGMA_OF
 
 
 def _sigma_parts(measured: Measures | None) -> list[float]:
     """Return the parts of each size's standard uncertainty: noise, level, set-up."""
     total, level, setup = (_sigmas(measured, part) for part in ("", "level", "setup"))
-    noise = np.sqrt(np.maximum(total**2 - level**2 - np.nan_to_num(setup) ** 2, 0.0))
-    return [*noise.tolist(), *level.tolist(), *setup.tolist()]
+    square, of_level, of_setup = np.array([total, level, setup]) ** 2
+    noise = np.sqrt(np.maximum(square - of_level - np.nan_to_num(of_setup), 0.0))
+    return [*noise.tolist(), *level, *setup]
 
 
-def _sigmas(measured: Measures | None, part: str) -> FloatArray:
+def _sigmas(measured: Measures | None, part: str) -> list[float]:
     """Return the σ of each of `measures.WITH_SIGMA`, or a part of it; NaN if unknown."""
-    return np.array([getattr(measured, name, math.nan) for name in measures.sigma_names(part)])
+    return [getattr(measured, name, math.nan) for name in measures.sigma_names(part)]
 
 
 def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.NDArray[Any]]:
@@ -271,11 +272,11 @@ def table_rows(
     tables = _tables_of_places(result, calibration)
     rows = {name: csv_rows(name, table, sigma_parts) for name, table in tables.items()}
     row = [
-        cell if column.digits is None else number(cell, column.digits)
+        as_cell(cell) if column.digits is None else number(cell, column.digits)
         for cell, column in zip(_cells(result), TABLES["measures"], strict=True)
         if sigma_parts or not column.is_part
     ]
-    return rows | {"measures": csv_text([row])}
+    return rows | {"measures": unescaped_csv_text([row])}
 
 
 def csv_header(name: str, sigma_parts: bool = False) -> str:

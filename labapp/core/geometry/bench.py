@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -49,6 +50,19 @@ class Bench:
             last = np.array([right[:, 0].min(), bottom[:, 1].min()])
             self._frames_px[frame_shape] = first, last
         return self._frames_px[frame_shape]
+
+    def frame_area_mm2(self, frame_shape: tuple[int, int]) -> float:
+        """Area of the imaging plane that a frame shows, mm²."""
+        if frame_shape not in self._areas_mm2:
+            height, width = frame_shape
+            corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+            seen = self.calibration.to_plane(corners).astype(np.float32)
+            self._areas_mm2[frame_shape] = float(cv2.contourArea(seen))
+        return self._areas_mm2[frame_shape]
+
+    @cached_property
+    def _areas_mm2(self) -> dict[tuple[int, int], float]:
+        return {}
 
     @cached_property
     def _frames_px(self) -> dict[tuple[int, int], tuple[FloatArray, FloatArray]]:

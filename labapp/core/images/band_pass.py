@@ -378,7 +378,7 @@ class _BandPassed:
         (x, y), moment = centroid_kernels.centroids(
             picture, around, taps, u, v, margin, width, reach
         )
-        return np.stack([u + x, v + y]), moment
+        return np.array([u + x, v + y]), moment
 
     def around(self) -> tuple[Grey, float]:
         """Return the downsampled, blurred picture and the blur's standard deviation, px."""
@@ -460,7 +460,7 @@ def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, speckle_px: float) 
     (u, v, bright), size = peaks, seen.size
     width = window_widths(band_pass_kernels.next_apart(pairs(u, v)), CENTROID_WIDENING * size)
     (u_px, v_px), moment = seen.light(u, v, width, CENTROID_WIDENING * size)
-    moment = np.clip(moment / 2, LEAST_MOMENT_PX2, MOST_MOMENT * width**2)
+    moment = np.minimum(np.maximum(moment / 2, LEAST_MOMENT_PX2), MOST_MOMENT * width**2)
     # Undo window, blur and background.
     spread = (1 / (1 / moment - 1 / width**2) - (LIGHT_BLUR * size) ** 2) / WIDTH_KEPT**2
     peak = bright / PEAK_GAIN
@@ -471,7 +471,7 @@ def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, speckle_px: float) 
         v_px=v_px,
         u_sigma_px=sigma,
         v_sigma_px=sigma.copy(),
-        size_px=np.sqrt(np.clip(spread, (0.3 * size) ** 2, (3.0 * size) ** 2)),
+        size_px=np.sqrt(np.minimum(np.maximum(spread, (0.3 * size) ** 2), (3.0 * size) ** 2)),
         peak=peak,
         snr=snr,
     )

@@ -26,6 +26,8 @@ SETTLED_PX = 1e-4
 @_inner
 def _mirrored(at: int, count: int) -> int:
     """Index of a pixel with reflection at the edges of the picture."""
+    if 0 <= at < count:
+        return at
     at %= 2 * count
     return 2 * count - 1 - at if at >= count else at
 

@@ -94,16 +94,17 @@ def without_spikes(
     """
     from labapp.core.images import band_pass_kernels
 
-    least = LEAST_NOISE * float(cv2.minMaxLoc(picture)[1])
+    least = LEAST_NOISE * float(picture.max())
     over = SPIKE * max(float(noise[::8, ::8].min()), least)
     reach = max(2, round(2.5 * size))
     (u, v), (times, beside) = band_pass_kernels.spikes(picture, over, size, DOUBTED, reach)
-    sharp = picture[v, u] - beside > SPIKE * noise[v, u]
-    u, v, times, beside = u[sharp], v[sharp], times[sharp], beside[sharp]
     begun = times > CERTAIN
     if suspects is not None:
         away = band_pass_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
         begun |= away <= 1.5 * size + 1.0
+    if begun.any():
+        sharp = picture[v, u] - beside > SPIKE * noise[v, u]
+        u, v, beside, begun = u[sharp], v[sharp], beside[sharp], begun[sharp]
     if not begun.any():
         return picture
     hot = band_pass_kernels.connected_pixels(u, v, begun)
@@ -114,7 +115,7 @@ def without_spikes(
 
 def pairs(u: IntArray, v: IntArray) -> FloatArray:
     """Places (u, v) of pixels, shape (n, 2)."""
-    return np.stack([u, v], axis=1).astype(float)
+    return np.array([u, v], float).T
 
 
 def widen(image: Grey, into: Grey, variance_px2: float) -> None:

@@ -110,14 +110,17 @@ def within_view(
     return visible
 
 
-@inner
-def widened(mask: BoolArray) -> BoolArray:
-    """`observation.widened` by one ring, shape (rows, columns)."""
+@compiled(_mask, types.int64)
+def widened(mask: BoolArray, rings: int) -> BoolArray:
+    """Dilate a mask over rays, shape (rows, columns), by a number of rings."""
     rows, columns = mask.shape
     wider = np.zeros((rows, columns), np.bool_)
     for i in range(rows):
         for j in range(columns):
-            wider[i, j] = mask[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2].any()
+            if mask[i, j]:
+                for k in range(max(i - rings, 0), min(i + rings + 1, rows)):
+                    for m in range(max(j - rings, 0), min(j + rings + 1, columns)):
+                        wider[k, m] = True
     return wider
 
 
@@ -272,7 +275,7 @@ def classify_rays(
             unlabelled[label] = False
     stray = np.flatnonzero(unlabelled)
     candidates = dots[stray]
-    around = np.flatnonzero(widened(amid(is_lit)).ravel()[known] & ~dotless[known])
+    around = np.flatnonzero(widened(amid(is_lit), 1).ravel()[known] & ~dotless[known])
     around = around[next_apart(shown[around]) < resolution]
     if len(stray) and len(around):
         apart = two_nearest(candidates, shown[around])[0][:, 0] > resolution

@@ -112,13 +112,10 @@ class Observation(ReadOnlyArrays):
         """The rays of the pattern."""
         return self.bench.rays
 
-    @cached_property
+    @property
     def frame_area_mm2(self) -> float:
         """Area of the imaging plane that the frame shows, mm²."""
-        height, width = self.frame_shape
-        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
-        seen = self.bench.calibration.to_plane(corners).astype(np.float32)
-        return float(cv2.contourArea(seen))
+        return self.bench.frame_area_mm2(self.frame_shape)
 
     @cached_property
     def hidden(self) -> BoolArray:
@@ -277,8 +274,6 @@ def within_rings(labels: IntArray, rings: int) -> BoolArray:
 
 def widened(mask: BoolArray, rings: int) -> BoolArray:
     """Dilate a mask over rays, shape (rows, columns), by a number of rings."""
-    lit = np.ascontiguousarray(mask).view(np.uint8)
-    return cv2.dilate(lit, _BESIDE, iterations=rings).view(bool)
+    from labapp.core.matching import match_kernels
 
-
-_BESIDE = np.ones((3, 3), np.uint8)
+    return match_kernels.widened(mask, rings)

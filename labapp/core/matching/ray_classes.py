@@ -88,15 +88,15 @@ def certain_witness(
     certain.flat[dark[~observed.in_view(paths.plane_mm[dark], view=view)]] = 0
     rim = np.flatnonzero((certain < 0) & widened(lit, 1))
     near = rim[~observed.in_view(paths.plane_mm[rim], NEAR_EDGE_MM, view)]
-    if _in_lines(near, witness.shape).any():
+    if _in_lines(near, witness.shape[1]).any():
         margin = OUT_OF_VIEW_SIGMA * np.sqrt(covariance_of(near)[:, [0, 1], [0, 1]])
         near = near[~observed.in_view(paths.plane_mm[near], margin, view)]
-    return np.where(_in_lines(near, witness.shape), 0, certain)
+        certain.flat[near[_in_lines(near, witness.shape[1])]] = 0
+    return certain
 
 
-def _in_lines(rays: IntArray, shape: tuple[int, ...]) -> BoolArray:
-    """Mask of the rays, flat indices, whose row or column holds `LEAST_LINE` or more of them."""
-    mask = np.zeros(shape, bool)
-    mask.flat[rays] = True
-    rows, columns = mask.sum(axis=1, keepdims=True), mask.sum(axis=0, keepdims=True)
-    return np.asarray(mask & ((rows >= LEAST_LINE) | (columns >= LEAST_LINE)))
+def _in_lines(rays: IntArray, columns: int) -> BoolArray:
+    """Mask of the rays, n flat indices, whose row or column holds `LEAST_LINE` or more of them."""
+    row, column = np.divmod(rays, columns)
+    in_row, in_column = np.bincount(row)[row], np.bincount(column)[column]
+    return np.asarray((in_row >= LEAST_LINE) | (in_column >= LEAST_LINE))

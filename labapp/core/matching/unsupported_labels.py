@@ -161,12 +161,12 @@ def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:
     from labapp.core.matching import match_kernels
 
     lit, plane_mm = fitted.labels != UNLABELLED, fitted.paths.plane_mm
-    dark_mm = plane_mm[np.flatnonzero(~lit & ~observed.rays.absent)]
     size = np.full(lit.shape, np.nan)
     size[lit] = observed.size_mm[fitted.labels[lit]]
     times = size / match_kernels.medians_around(size)
     wide = times > WIDE
     for ray in np.flatnonzero(~wide & (times > WIDE_BESIDE)):
+        dark_mm = plane_mm[(~lit & ~observed.rays.absent).ravel()]
         apart_mm = np.linalg.norm(dark_mm - plane_mm[ray], axis=-1)
         wide.flat[ray] = (apart_mm < BESIDE_RESOLUTIONS * observed.resolution_mm).any()
     return wide

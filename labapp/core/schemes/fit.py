@@ -140,9 +140,10 @@ def bound_and_measure(
     shape_parameters, by_shape = shape_and_gradients(
         basis, coefficients, level.rear, boundary, slope
     )
-    gradient, by_drop = np.split(np.concatenate([sizes.gradient, by_shape]), [-1], axis=1)
+    by_all = np.concatenate([sizes.gradient, by_shape])
+    gradient, by_drop = by_all[:, :-1], by_all[:, -1]
     # The splines add up to 1: the sum is the derivative by the shift.
-    level_sigma = level.sigma_of(gradient.sum(axis=1), by_drop[:, 0])
+    level_sigma = level.sigma_of(gradient.sum(axis=1), by_drop)
     former = None if previous is None else nearest_part(previous.setup_parts, sizes.values)
     if former is not None:
         sigma_of_setup = former.sigma
@@ -161,7 +162,7 @@ def bound_and_measure(
         size_sigma_setup=sigma_of_setup,
     )
     errors = measures.reflection_errors(reconstruction, match, rig)
-    sizes_and_shape = np.append(sizes.values, shape_parameters)
+    sizes_and_shape = np.concatenate([sizes.values, shape_parameters])
     return reconstruction, measures.assemble_measures(
         errors, sizes_and_shape, sizes.peak_mm, center, reconstruction
     )

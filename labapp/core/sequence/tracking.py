@@ -11,6 +11,7 @@ As in `match_rays`, a dot whose ray is ambiguous gets none.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -130,10 +131,10 @@ def track(
     orientation = prior.cold_match.orientation
     others = (trial for trial in prior.cold_match.trials if trial.orientation != orientation)
     trials = (Trial(orientation, pool.residual_rms_mm), *others)
-    at = np.stack(np.divmod(rays, fit.labels.shape[1]), axis=-1)
-    missed = len(classes.missed)
+    lit, missed = fit.labels != UNLABELLED, len(classes.missed)
+    at = np.argwhere(lit)
     match = match_of_pairs(observed, at, dots, orientation, classes.witness, missed, trials)
-    return Tracked(match, pool, paths, fit.labels != UNLABELLED, is_seen)
+    return Tracked(match, pool, paths, lit, is_seen)
 
 
 @dataclass
@@ -324,12 +325,13 @@ def _labels_near_predictions(
     off, ray = band_pass_kernels.two_nearest(observed.plane_mm, plane)
     other, dot = band_pass_kernels.two_nearest(plane, observed.plane_mm)
     own, off_own = ray[:, 0], off[:, 0]
-    gate = GATE * step[own]
-    sure = (off_own < gate) & (step[own] > observed.resolution_mm) & lit.ravel()[near[own]]
+    apart, rays = step[own], near[own]
+    gate = GATE * apart
+    sure = (off_own < gate) & (apart > observed.resolution_mm) & lit.ravel()[rays]
     sure &= (dot[own, 0] == np.arange(len(own))) & (off[:, 1] > CLEARLY * off_own)
     sure &= other[own, 1] > gate  # speckle may split a dot in two
-    labels.ravel()[near[own[sure]]] = np.flatnonzero(sure)
-    return labels, off_own[sure] / step[own[sure]]
+    labels.ravel()[rays[sure]] = np.flatnonzero(sure)
+    return labels, off_own[sure] / apart[sure]
 
 
 def _extended_labels(fit: _Fit) -> IntArray:
@@ -343,7 +345,7 @@ def _extended_labels(fit: _Fit) -> IntArray:
     next_mm = np.full(len(known), np.inf)
     next_mm[looked_for] = band_pass_kernels.next_apart(paths.plane_mm[looked_for])
     labels, rays = fit.labels.copy().ravel(), fit.lit_rays
-    off = np.linalg.norm(paths.plane_mm[rays] - observed.plane_mm[labels[rays]], axis=-1)
+    off = np.hypot(*(paths.plane_mm[rays] - observed.plane_mm[labels[rays]]).T)
     labels[rays[off > np.maximum(6.0 * median(off), ASTRAY * next_mm[rays])]] = UNLABELLED
     is_free = np.ones(len(observed.plane_mm), bool)
     is_free[labels[labels != UNLABELLED]] = False
@@ -433,9 +435,8 @@ def _reference_is_seen(observed: Observation, paths: RayPaths, off: float) -> bo
     plane = paths.plane_mm[hole]
     if not np.isfinite(plane).all():
         raise TrackLost("the absent ray is at the pool's edge")
-    reach = min(np.linalg.norm(plane[1] - plane[2]), np.linalg.norm(plane[3] - plane[4])) / 2
-    between = observed.plane_mm - plane[:, None]
-    empty = np.linalg.norm(between, axis=-1).min(axis=1) > reach / 2
+    reach = min(math.dist(plane[1], plane[2]), math.dist(plane[3], plane[4])) / 2
+    empty = band_pass_kernels.two_nearest(plane, observed.plane_mm)[0][:, 0] > reach / 2
     if not empty[0]:
         raise TrackLost("a dot is in the hole of the absent one")
     if sum(empty[1:]) > (2 if off < PREDICTED else 0):

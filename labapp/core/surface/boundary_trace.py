@@ -93,9 +93,9 @@ def retrace_boundary(
     """
     from labapp.core.surface.kernels import boundary_kernels
 
-    radius = np.linalg.norm(before.points_mm[:, :2] - before.center_mm, axis=-1)
+    radius = np.hypot(*(before.points_mm[:, :2] - before.center_mm).T)
     theta = np.radians(before.theta_deg)
-    way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    way = np.array([np.cos(theta), np.sin(theta)]).T
     longest, rear = np.full(len(radius), LONGEST_MM), level.rear.as_array
     radius, boundary_slope, over = boundary_kernels.newton_to_boundary(
         basis.grid, coefficients, rear, center_mm, way, radius, longest, LAST_MM

@@ -297,10 +297,10 @@ def refined(
     spread = math.hypot(c_xx - c_yy, c_xy)
     if not -sign * (c_xx + c_yy) - spread > 1e-9:  # the smaller of twice its curvatures
         return start_mm
-    area = 4 * c_xx * c_yy - c_xy * c_xy
-    vertex = np.array([c_xy * b_y - 2 * c_yy * b_x, c_xy * b_x - 2 * c_xx * b_y]) / area
-    at = start_mm[:2] + np.clip(vertex, -2 * STENCIL_MM, 2 * STENCIL_MM)
-    if not boundary.contains(at[0], at[1]):
+    area, reach = 4 * c_xx * c_yy - c_xy * c_xy, 2 * STENCIL_MM
+    vertex = (c_xy * b_y - 2 * c_yy * b_x) / area, (c_xy * b_x - 2 * c_xx * b_y) / area
+    x, y = start_mm[:2] + [min(max(off, -reach), reach) for off in vertex]
+    if not boundary.contains(x, y):
         return start_mm
-    refined = np.append(at, height(at[0], at[1]))
+    refined = np.append([x, y], height(x, y))
     return refined if sign * refined[2] >= sign * start_mm[2] else start_mm

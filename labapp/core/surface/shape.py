@@ -7,7 +7,7 @@ Asymmetry and slope at the boundary indicate a torch beside the joint, undercut 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 
@@ -35,7 +35,11 @@ def shape_of(surface: Surface, boundary: Boundary) -> FloatArray:
     boundary
         The pool's boundary.
     """
-    return _shape_parameters(*_samples(surface, boundary))
+    from labapp.core.surface.kernels import shape_kernels
+
+    return shape_kernels.shape_parameters(
+        *_samples(boundary, lambda at: surface.height(*at.T), lambda at: surface.gradient(*at.T))
+    )
 
 
 def shape_and_gradients(
@@ -57,10 +61,13 @@ def shape_and_gradients(
     rear, boundary, boundary_slope
         The rear of the level, and the boundary traced with it (`trace_boundary`).
     """
-    from labapp.core.surface.kernels import shape_kernels
+    from labapp.core.surface.kernels import shape_kernels, spline_kernels
 
-    spokes, rim = _samples(_Evaluated(basis, coefficients), boundary)
-    parameters = _shape_parameters(spokes, rim)
+    def at(place_mm: FloatArray) -> FloatArray:
+        return spline_kernels.surface_at(basis.grid, coefficients, place_mm)
+
+    spokes, rim = _samples(boundary, lambda place: at(place)[0], lambda place: at(place)[1:].T)
+    parameters = shape_kernels.shape_parameters(spokes, rim)
     return parameters, shape_kernels.shape_gradients(
         basis.grid,
         coefficients,
@@ -73,62 +80,22 @@ def shape_and_gradients(
     )
 
 
-@dataclass(frozen=True)
-class _Evaluated:
-    """A spline surface within its rectangle, evaluated by the compiled kernels."""
-
-    basis: SplineBasis
-    coefficients: FloatArray
-
-    def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        return np.asarray(self._at(x_mm, y_mm)[0].reshape(x_mm.shape))
-
-    def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        return np.asarray(self._at(x_mm, y_mm)[1:].T.reshape(*x_mm.shape, 2))
-
-    def _at(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        from labapp.core.surface.kernels import spline_kernels
-
-        places = np.column_stack([x_mm.ravel(), y_mm.ravel()])
-        return spline_kernels.surface_at(self.basis.grid, self.coefficients, places)
-
-
 _Samples = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
-def _samples(surface: Surface, boundary: Boundary) -> tuple[_Samples, _Samples]:
+def _samples(
+    boundary: Boundary,
+    height: Callable[[FloatArray], FloatArray],
+    gradient: Callable[[FloatArray], FloatArray],
+) -> tuple[_Samples, _Samples]:
     """Sample a surface on spokes from the middle of its boundary, and next to the boundary.
 
+    Its height, shape (n,), and gradient, shape (n, 2), are functions of places, shape (n, 2), mm.
     Returns the ``spokes`` and the ``rim`` of `shape_kernels.shape_gradients`.
     """
     from labapp.core.surface.kernels import shape_kernels
 
     spokes, rim = shape_kernels.sample_places(boundary.points_mm, boundary.center_mm)
     (_, _, place_mm), (_, inward, rim_mm) = spokes, rim
-    height_mm = surface.height(place_mm[..., 0], place_mm[..., 1])
-    rise = np.vecdot(surface.gradient(rim_mm[:, 0], rim_mm[:, 1]), inward)
-    return (*spokes, height_mm), (*rim, rise)
-
-
-def _shape_parameters(spokes: _Samples, rim: _Samples) -> FloatArray:
-    """`shape_of` the samples of a surface (`_samples`)."""
-    from labapp.core.surface.kernels.shape_kernels import (
-        ENDS,
-        FRACTION,
-        HALVED_WEIGHT,
-        RIGHT,
-        SPOKES,
-    )
-
-    (_, reach_mm, _, height_mm), (length_mm, _, _, rise) = spokes, rim
-    lengths = reach_mm[ENDS, None] * HALVED_WEIGHT
-    area = reach_mm[:, None] ** 2 * (HALVED_WEIGHT * FRACTION) * (2 * np.pi / SPOKES)
-    volume = np.sum(area * np.abs(height_mm), axis=1)
-    right, left = RIGHT @ volume, (1 - RIGHT) @ volume
-    return np.array(
-        [
-            np.sum(height_mm[ENDS] * lengths) / lengths.sum(),
-            (right - left) / max(right + left, 1e-30),
-            np.degrees(np.arctan(rise)) @ length_mm / length_mm.sum(),
-        ]
-    )
+    height_mm = height(place_mm.reshape(-1, 2)).reshape(place_mm.shape[:2])
+    return (*spokes, height_mm), (*rim, np.vecdot(gradient(rim_mm), inward))

@@ -62,17 +62,16 @@ def sizes_and_gradients(
     grid, outline, center = basis.grid, boundary.points_mm, boundary.center_mm
 
     def height(x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        place_mm = np.stack([x_mm, y_mm], axis=-1).reshape(-1, 2)
-        z = spline_kernels.surface_at(grid, coefficients, place_mm)[0]
-        return np.asarray(z.reshape(np.shape(x_mm)))
+        place_mm = np.array([x_mm, y_mm]).reshape(2, -1).T
+        return np.asarray(spline_kernels.surface_at(grid, coefficients, place_mm)[0])
 
     count, rear = len(coefficients), level.rear.as_array
     samples, over, share = boundary_kernels.spokes(
         grid, coefficients, outline, center, FRACTION, WEIGHT, rear, STRIDE
     )
     extremes, changes = [], np.zeros((2, count + 1))
-    for sign, change in zip((1.0, -1.0), changes, strict=True):
-        within, extreme = (places[np.argmax(sign * places[:, 2])] for places in (samples, outline))
+    for sign, change, of_most in zip((1, -1), changes, (np.argmax, np.argmin), strict=True):
+        within, extreme = (places[of_most(places[:, 2])] for places in (samples, outline))
         # An extreme on the boundary is not refined; one within it may lie between samples.
         if sign * within[2] >= sign * extreme[2]:
             extreme = measures.refined(height, boundary, within, sign)

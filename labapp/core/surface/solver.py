@@ -146,7 +146,7 @@ class Rounds:
         from labapp.core.surface.kernels import rounds_kernels
 
         own = self.equations
-        smooth = np.zeros_like(self.coefficients) if smooth_about is None else smooth_about
+        smooth = np.zeros(own.basis.count) if smooth_about is None else smooth_about
         known = (own.stiffness, np.nan) if own.factor is None else (own.factor, self.moved_mm)
         steps = 1 if search is NO_SEARCH or search.near is not None else NEWTON_STEPS
         level_input, level, search_limits = search.for_kernel

@@ -110,6 +110,30 @@ def sample_places(
     return (middle, reach, place), (length, inward, rim)
 
 
+@_compiled(_spokes, _rims)
+def shape_parameters(
+    spokes: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    rim: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+) -> FloatArray:
+    """Convexity, asymmetry and wetting slope (`shape.shape_of`), shape (3,).
+
+    ``spokes`` and ``rim`` are those of `shape_gradients`.
+    """
+    (_, reach, _, height), (length, _, _, rise) = spokes, rim
+    section, along, right, left = 0.0, 0.0, 0.0, 0.0
+    for e in ENDS:
+        for r in range(RINGS):
+            section += reach[e] * HALVED_WEIGHT[r] * height[e, r]
+            along += reach[e] * HALVED_WEIGHT[r]
+    for s in range(SPOKES):
+        for r in range(RINGS):
+            area = reach[s] ** 2 * HALVED_WEIGHT[r] * FRACTION[r] * 2 * np.pi / SPOKES
+            right += RIGHT[s] * area * abs(height[s, r])
+            left += (1 - RIGHT[s]) * area * abs(height[s, r])
+    wetting = np.sum(np.degrees(np.arctan(rise)) * length) / np.sum(length)
+    return np.array([section / along, (right - left) / max(right + left, 1e-30), wetting])
+
+
 @_inner
 def _convexity(
     grid: FloatArray,
@@ -202,7 +226,7 @@ def _wetting(
     """
     length, inward, place, rise = rim
     count, whole, work = len(outline), length.sum(), np.empty((4, 4))
-    pull = np.empty((count, 2))
+    pull, bend = np.empty((count, 2)), np.empty(2)
     for k in range(count):
         over = (np.degrees(np.arctan(rise[k])) - wetting_deg) / whole
         pull[k, 0], pull[k, 1] = over * inward[k, 1], -over * inward[k, 0]
@@ -210,7 +234,7 @@ def _wetting(
         turned = np.degrees(length[k] / (1 + rise[k] ** 2) / whole)
         a, b = boundary_slope[k]
         by_move = 0.0
-        bend = np.zeros(2)
+        bend[:] = 0.0
         for way in (1.0, -1.0):
             x = place[k, 0] + way * STEP_MM * inward[k, 0]
             y = place[k, 1] + way * STEP_MM * inward[k, 1]

@@ -94,6 +94,8 @@ def accumulate_at_boundary(
     Where the boundary lies lower by dz it moves as if the surface were higher by dz. The derivative
     by the drop (`Rear.height`) is the last value of ``out``.
     """
+    if share == 0.0:  # what moves with the boundary's height is 0 except at a rear that lies lower
+        return
     accumulate_splines(grid, x, y, share, work, out)
     part = max((rear[1] - y) / (rear[1] - rear[2]), 0.0)
     out[-1] += share * part * part
