@@ -159,13 +159,9 @@ def _with_rivals(
 
 def _step(one: Hypothesis, other: Hypothesis) -> tuple[int, int]:
     """Rows and columns by which the rays of most dots are shifted in another hypothesis."""
-    count = max(one.labels.max(), other.labels.max()) + 1
-    at = np.full((2, count, 2), np.nan)
-    for place, labels in zip(at, (one.labels, other.labels), strict=True):
-        rays = np.argwhere(labels != UNLABELLED)
-        place[labels[tuple(rays.T)]] = rays
-    shared = np.isfinite(at).all(axis=(0, 2))
-    steps, counts = np.unique((at[1] - at[0])[shared], axis=0, return_counts=True)
+    rays = _rays_of_dots(one, other)
+    at = np.stack(np.divmod(rays[:, (rays >= 0).all(axis=0)], one.labels.shape[1]), axis=-1)
+    steps, counts = np.unique(at[1] - at[0], axis=0, return_counts=True)
     row, column = steps[np.argmax(counts)]
     return int(row), int(column)
 
@@ -360,6 +356,15 @@ def _rivals(
 
 def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:
     """Dots with different rays in two hypotheses, and the number of dots with a ray in both."""
-    rays = [{int(dot): at for at, dot in np.ndenumerate(h.labels)} for h in (one, other)]
-    shared = rays[0].keys() & rays[1].keys() - {UNLABELLED}
-    return [dot for dot in shared if rays[0][dot] != rays[1][dot]], len(shared)
+    own, others = _rays_of_dots(one, other)
+    shared = (own >= 0) & (others >= 0)
+    return np.flatnonzero(shared & (own != others)).tolist(), int(np.count_nonzero(shared))
+
+
+def _rays_of_dots(one: Hypothesis, other: Hypothesis) -> IntArray:
+    """Flat index of each dot's ray in two hypotheses, or −1, shape (2, dots)."""
+    rays = np.full((2, max(one.labels.max(), other.labels.max()) + 1), -1)
+    for ray, labels in zip(rays, (one.labels, other.labels), strict=True):
+        lit = np.flatnonzero(labels != UNLABELLED)
+        ray[labels.flat[lit]] = lit
+    return rays

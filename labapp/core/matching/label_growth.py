@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy
 
 from labapp.core.matching.observation import (
     LEAST_LABELS,
@@ -111,7 +110,10 @@ def _grown_until_stable(
         pool = try_fit(observed, labels, settings, pool)
         if pool is None:
             return None
-        labels = matched_labels(observed, pool, labels)
+        key = labels.tobytes(), settings
+        if key not in observed.matched:  # different hypotheses often come to the same labels
+            observed.matched[key] = matched_labels(observed, pool, labels)
+        labels = observed.matched[key]
         state = labels.tobytes()
         if state in before:
             break
@@ -145,14 +147,13 @@ def _without_far_labels(observed: Observation, labels: IntArray, settings: FitSe
     """Remove labels whose residual from the surface through all of them is an outlier."""
     if len(observed.plane_mm) < 2:
         return labels
-    spacing = scipy.spatial.cKDTree(observed.plane_mm).query(observed.plane_mm, k=2)[0][:, 1]
     for _ in range(3):
         pool = try_fit(observed, labels, settings)
         if pool is None:
             return labels
         at = np.argwhere(labels != UNLABELLED)
         off = np.linalg.norm(pool.residual_mm, axis=-1)
-        allowed = OUTLIER_SPACINGS * spacing[labels[at[:, 0], at[:, 1]]]
+        allowed = OUTLIER_SPACINGS * observed.spacing_mm[labels[at[:, 0], at[:, 1]]]
         bad = off > np.maximum(OUTLIER_TIMES * median(off), allowed)
         if not bad.any():
             return labels

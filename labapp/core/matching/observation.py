@@ -11,6 +11,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+import scipy
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.optics import ProjectedRays
@@ -102,6 +103,11 @@ class Observation(ReadOnlyArrays):
         """Distance below which two dots merge, mm."""
         return RESOLVED_SIZES * median(self.size_mm)
 
+    @cached_property
+    def spacing_mm(self) -> FloatArray:
+        """Distance of each dot from the nearest other one, shape (n,), mm."""
+        return np.asarray(scipy.spatial.cKDTree(self.plane_mm).query(self.plane_mm, k=2)[0][:, 1])
+
     @property
     def rig(self) -> Rig:
         """The rig of the bench."""
@@ -183,6 +189,11 @@ class Observation(ReadOnlyArrays):
 
     @cached_property
     def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | tuple[str, str]]:
+        return {}
+
+    @cached_property
+    def matched(self) -> dict[tuple[bytes, FitSettings], IntArray]:
+        """Results of `label_growth.matched_labels`, by the labels and settings of the fit."""
         return {}
 
     def in_view(

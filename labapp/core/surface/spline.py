@@ -136,28 +136,29 @@ class SplineBasis(ReadOnlyArrays):
         """Number of splines."""
         return self.shape[0] * self.shape[1]
 
-    @cached_property
+    @property
     def low_mm(self) -> FloatArray:
         """Lower corner of the rectangle, shape (2,), mm."""
-        return np.array([self.x_knots[DEGREE], self.y_knots[DEGREE]])
+        return self.grid[:, 0]
 
-    @cached_property
+    @property
     def high_mm(self) -> FloatArray:
         """Upper corner of the rectangle, shape (2,), mm."""
-        return np.array([self.x_knots[-DEGREE - 1], self.y_knots[-DEGREE - 1]])
+        return self.grid[:, 1]
 
-    @cached_property
+    @property
     def step_mm(self) -> FloatArray:
         """Distance between knots along x and along y, shape (2,), mm."""
-        x, y = self.x_knots, self.y_knots
-        return np.array([(x[-1] - x[0]) / (len(x) - 1), (y[-1] - y[0]) / (len(y) - 1)])
+        return self.grid[:, 2]
 
     @cached_property
     def grid(self) -> FloatArray:
         """Low and high end, step, mm, and number of cells along x and along y, shape (2, 4)."""
-        nx, ny = self.shape
-        ends = self.low_mm, self.high_mm, self.step_mm, np.array([nx - DEGREE, ny - DEGREE], float)
-        return np.array(ends).T
+        axes = self.x_knots.tolist(), self.y_knots.tolist()
+        ends = [(axis[DEGREE], axis[-DEGREE - 1]) for axis in axes]
+        steps = [(axis[-1] - axis[0]) / (len(axis) - 1) for axis in axes]
+        cells = [len(axis) - 2 * DEGREE - 1 for axis in axes]
+        return np.array([(*end, *by) for end, *by in zip(ends, steps, cells, strict=True)])
 
     def cells(self, x_mm: FloatArray, y_mm: FloatArray) -> Cells:
         """Find the cells of points, each shape (n,); the outermost extend beyond the rectangle."""

@@ -51,40 +51,22 @@ SUNK_COST = -float(np.log(SHARE_SUNK / (1 - SHARE_SUNK) / (len(DROPS_MM) - 1))) 
 
 
 @_inner
-def _multiply(factors: FloatArray, k: int, way: int, factor: float, shrinks: float) -> None:
-    """Multiply entries from k on in one direction by 1 + factor, as the factor decays to `EPS`.
-
-    Four factors are updated in parallel to avoid a chain of dependent operations.
-    """
-    count, square = len(factors), shrinks * shrinks
-    second, third, fourth = factor * shrinks, factor * square, factor * square * shrinks
-    shrinks = square * square
-    while 0 <= k + 3 * way < count and factor > EPS:
-        factors[k] *= 1.0 + factor
-        factors[k + way] *= 1.0 + second
-        factors[k + 2 * way] *= 1.0 + third
-        factors[k + 3 * way] *= 1.0 + fourth
-        factor, second, third, fourth = (
-            factor * shrinks,
-            second * shrinks,
-            third * shrinks,
-            fourth * shrinks,
-        )
-        k += 4 * way
-    for last in (factor, second, third):
-        if 0 <= k < count:
-            factors[k] *= 1.0 + last
-            k += way
+def _multiply(factors: FloatArray, term: float, ratio: float) -> None:
+    """Multiply each entry by 1 + the next term of a geometric progression."""
+    for k in range(len(factors)):
+        factors[k] *= 1.0 + term
+        term *= ratio
 
 
 @_inner
 def _accumulate(
-    factors: FloatArray, lines: FloatArray, start: float, slope: float, sign: float
+    factors: FloatArray, lines: FloatArray, start: float, slope: float, grows: float, sign: float
 ) -> None:
     """Add log(1 + exp(−(start + k · slope))) to every level k, with a sign.
 
-    Along the levels the exponential is a geometric progression. Where its exponent is positive it
-    is taken out of the logarithm, into the sums of starts and of slopes, ``lines``.
+    Along the levels the exponential is a geometric progression, with ``grows`` = exp |slope| or its
+    inverse. Where its exponent is positive it is taken out of the logarithm, into the sums of
+    starts and of slopes, ``lines``.
     """
     count = len(factors)
     if min(start, start + (count - 1) * slope) > FARTHEST:
@@ -95,11 +77,13 @@ def _accumulate(
     for at, way in ((begins, -sign), (ends, sign)):
         lines[0, at] += way * start
         lines[1, at] += way * slope
-    shrinks = np.exp(-abs(slope))
-    for at, way in ((turn, 1), (turn - 1, -1)):
-        away = abs(start + at * slope)
-        if 0 <= at < count and away < FARTHEST:
-            _multiply(factors, at, way, np.exp(-away), shrinks)
+    reach = min(FARTHEST / abs(slope), count)  # number of levels with a term of `EPS` or more
+    if turn < count and abs(start + turn * slope) < FARTHEST:
+        after = factors[turn : turn + int(reach) + 1]
+        _multiply(after, np.exp(-abs(start + turn * slope)), 1.0 / grows)
+    if turn > 0 and abs(start + (turn - 1) * slope) < FARTHEST:
+        low = max(turn - int(reach) - 1, 0)
+        _multiply(factors[low:turn], np.exp(-abs(start + low * slope)), grows)
 
 
 @_inner
@@ -112,23 +96,26 @@ def _add_witnesses(
     missing: float,
     levels: tuple[float, float, int],
 ) -> None:
-    """Add the terms of some rays to the sums of `level_negative_log_likelihood`."""
+    """Add the terms of some rays to the sums of `level_negative_log_likelihood` for every drop."""
     (nats, factors, lines), (first, step, _) = sums, levels
     for m in range(len(rays)):
         n = rays[m]
-        start, slope = sharp[n] * (over[n] + first), sharp[n] * step
-        _accumulate(factors[0], lines, start, slope, 1.0)
-        if dark[n] and missing > 0.0:
-            _accumulate(factors[1], lines, start - np.log(missing), slope, -1.0)
+        slope = sharp[n] * step
+        grows = np.exp(abs(slope))
+        for d in range(len(over)):
+            start = sharp[n] * (over[d, n] + first)
+            _accumulate(factors[d, 0], lines[d], start, slope, grows, 1.0)
+            if dark[n] and missing > 0.0:
+                with_dot = start - np.log(missing)
+                _accumulate(factors[d, 1], lines[d], with_dot, slope, grows, -1.0)
         if m % RAYS_PER_LOG == RAYS_PER_LOG - 1:
-            nats += np.log(factors[0] / factors[1])
+            nats += np.log(factors[:, 0] / factors[:, 1])
             factors[:] = 1.0
 
 
 @_inner
-def _total(sums: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
-    """Nats of each level from the sums of `_add_witnesses`."""
-    nats, factors, lines = sums
+def _total(nats: FloatArray, factors: FloatArray, lines: FloatArray) -> FloatArray:
+    """Nats of each level from the sums of `_add_witnesses` for one drop."""
     total, start, slope = np.empty(len(nats)), 0.0, 0.0
     for k in range(len(nats)):
         start, slope = start + lines[0, k], slope + lines[1, k]
@@ -178,23 +165,27 @@ def level_negative_log_likelihood(
     FloatArray
         Nats, shape (d, b, count); infinite for blurs that are negligible at all levels.
     """
-    made, count = np.full((len(over), blurs.shape[1], levels[2]), np.inf), levels[2]
+    drops, count = len(over), levels[2]
+    made = np.full((drops, blurs.shape[1], count), np.inf)
     is_same = np.ones(len(signed_sharpness), np.bool_)
-    for d in range(1, len(over)):
+    for d in range(1, drops):
         is_same &= over[d] == over[0]
     # Rays at the head lie as high whatever the drop: their terms are added once.
     same, others = np.flatnonzero(is_same), np.flatnonzero(~is_same)
     least = np.inf
     for b in range(blurs.shape[1] - 1, -1, -1):
         sharp = signed_sharpness / np.sqrt(blurs[0, b] * blurs[0, b] + spread)
-        common = np.zeros(count), np.ones((2, count)), np.zeros((2, count + 1))
-        _add_witnesses(common, same, over[0], sharp, dark, missing, levels)
-        if len(over) > 1 and _total(common).min() + blurs[1, b] > least + FARTHEST:
-            continue  # the other rays can only add to it
-        for d in range(len(over)):
-            sums = common[0].copy(), common[1].copy(), common[2].copy()
-            _add_witnesses(sums, others, over[d], sharp, dark, missing, levels)
-            made[d, b] = _total(sums)
+        nats, factors = np.zeros((drops, count)), np.ones((drops, 2, count))
+        lines = np.zeros((drops, 2, count + 1))
+        common = nats[:1], factors[:1], lines[:1]
+        _add_witnesses(common, same, over[:1], sharp, dark, missing, levels)
+        if drops > 1:
+            if _total(nats[0], factors[0], lines[0]).min() + blurs[1, b] > least + FARTHEST:
+                continue  # the other rays can only add to it
+            nats[1:], factors[1:], lines[1:] = nats[0], factors[0], lines[0]
+        _add_witnesses((nats, factors, lines), others, over, sharp, dark, missing, levels)
+        for d in range(drops):
+            made[d, b] = _total(nats[d], factors[d], lines[d])
             least = min(least, made[d, b].min() + blurs[1, b])
     return made
 

@@ -17,6 +17,9 @@ LONGEST_STEP_MM, LEAST_DESCENT = 0.5, 0.05
 """Longest Newton step along a ray, mm, and the least descent towards the surface that is assumed
 per mm of the ray: a step along a grazing ray would otherwise leave the pool."""
 
+LEAST_STEP_MM = 1e-12
+"""Newton's method stops after a shorter step: the slopes before and after it are the same."""
+
 TIP_MARGIN_MM = 0.3
 """A ray that passes less than this below the electrode's tip may be hidden."""
 
@@ -153,7 +156,9 @@ def intersect_and_reflect(
         ray, point = rays[k], met[k]
         slope_x, slope_y = 0.0, 0.0
         for _ in range(steps):
-            _, slope_x, slope_y = newton_step(grid, coefficients, ray, point, work)
+            step, slope_x, slope_y = newton_step(grid, coefficients, ray, point, work)
+            if abs(step) < LEAST_STEP_MM:
+                break
         slopes[k, 0], slopes[k, 1] = slope_x, slope_y
         dots[k, 0] = dots[k, 1] = np.nan
         if grid[0, 0] <= point[0] <= grid[0, 1] and grid[1, 0] <= point[1] <= grid[1, 1]:
