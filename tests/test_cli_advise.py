@@ -23,6 +23,12 @@ projection_angle_deg = 26
 distance_mm = 40
 plane_distance_mm = [60, 65]
 """
+LINES = """[pattern]
+kind = "lines"
+count = 5
+interline_angle_deg = 2.0
+fan_angle_deg = 20.0
+"""
 
 
 def write_question(folder: Path, text: str) -> Path:
@@ -75,6 +81,7 @@ def test_options_override_the_file_and_no_solution_is_reported(labapp: Run, tmp_
         (POOLS.replace("convex", "flat"), (), "pools.kind"),
         (POOLS + "[camera]\npx_per_mm = -1\n", (), "camera.px_per_mm"),
         (POOLS + "[bench]\nprojection_angle_deg = [6, 30]\n", (), "above half the fan"),
+        (POOLS + LINES, (), 'pattern.kind: "lines"; expected a pattern of dots'),
         (POOLS, ("--height", "4:5"), "overhang"),
         (POOLS, ("--width", "8:6"), "pools.width_mm"),
         (POOLS, ("--width", "x"), "--width"),

@@ -13,6 +13,7 @@ from tests.conftest import Run
 
 DATA = Path(__file__).parent / "data"
 SETUP = Path(__file__).parents[1] / "sample_sessions" / "gtaw" / "setup.toml"
+LINES_SETUP = str(SETUP.parents[1] / "five_lines" / "setup.toml")
 
 pytestmark = pytest.mark.usefixtures("state")
 
@@ -123,6 +124,18 @@ def test_budget_of_a_setup_file(
     assert float(everything["predicted_pct"]) > float(random["predicted_pct"]) > 0
 
 
+def test_budget_of_a_pool_without_enough_dots_is_refused(
+    labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("labapp.studies.predicted_budget.POOLS", 2)
+    monkeypatch.setattr("labapp.studies.predicted_budget.MOVED_POOLS", 1)
+    size = ("--width", "1", "--length", "1", "--height", "0.05")
+    code, out, err = labapp("analyze", "budget", *size, "--out", str(tmp_path / "out"))
+    assert (code, out) == (2, "")
+    assert "none of 2 pools like it gives a surface" in " ".join(err.split())
+    assert "Warning" not in err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -134,6 +147,7 @@ def test_budget_of_a_setup_file(
         (("budget", "--height", "0"), "the expected pool: height: 0.0; expected 0.01 to 30 mm"),
         (("budget", "--height", "nan"), "the expected pool: height: nan; expected 0.01 to 30 mm"),
         (("budget", "--height", "4"), "expected a possible pool"),
+        (("budget", "--setup", LINES_SETUP), "pattern"),
         (("budget", "--width", "-3"), "the expected pool: width: -3.0; expected 1 to 30 mm"),
         (("budget", "--setup", "{}/none.toml"), "none.toml"),
         (("positioning", "--out", "{}", "--format", "gif"), "--format"),

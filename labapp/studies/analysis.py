@@ -184,13 +184,27 @@ def analyze_budget(
         The kind of pool: see `expected_pool`.
     progress
         May raise to stop.
+
+    Raises
+    ------
+    InputError
+        If the pattern of the set-up consists of lines, or no such pool gives a surface.
     """
     import numpy as np
 
     from labapp.studies.pictures import bars_picture
     from labapp.studies.predicted_budget import budget_table, predicted_budget
 
-    table = budget_table(predicted_budget(_rig(setup), pool, progress))
+    if setup is not None and setup.line_rig is not None:
+        raise InputError("the error budget", "pattern", "lines", "a pattern of dots")
+    found = predicted_budget(_rig(setup), pool, progress)
+    if found.empty:
+        foot = pool.footprint
+        length = foot.head_mm + foot.tail_mm
+        size = f"{foot.width_mm:g} × {length:g} × {pool.peak_mm:g} mm"
+        right = f"a larger pool: none of {len(found.random)} pools like it gives a surface"
+        raise InputError("the expected pool", "size", size, right)
+    table = budget_table(found)
     names, *columns = zip(*table.rows, strict=True)
     predicted, simulated = (np.array(column, float) for column in columns)  # None becomes NaN
     values = {"predicted": predicted, "simulated": simulated}

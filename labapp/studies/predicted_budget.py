@@ -49,6 +49,17 @@ class SetupBudget(ReadOnlyArrays):
     for some of the pools, shape (k, q).
     """
 
+    @property
+    def lost(self) -> int:
+        """Number of pools without a surface."""
+        return int(np.isnan(self.random).sum())
+
+    @property
+    def empty(self) -> bool:
+        """Whether no pool gives a surface, and none has enough dots to predict its error."""
+        predicted = any(np.isfinite(one.total_mm) for one in self.predicted)
+        return not predicted and self.lost == len(self.random)
+
 
 def predicted_budget(
     rig: Rig, pool: Pool, progress: Progress | None = None, workers: int | None = None
@@ -111,6 +122,8 @@ def _simulated(
 def budget_table(budget: SetupBudget) -> Table:
     """Budget in % of the pool's height, predicted and simulated."""
     height = abs(budget.pool.peak_mm)
+    # The error of a pool with too few dots is not predicted, and no calibration changes it.
+    known = [one for one in budget.predicted if np.isfinite(one.total_mm)]
     rows: list[tuple[str | float | None, ...]] = []
     parts = (
         ("which rays come back", "boundary_mm"),
@@ -118,27 +131,32 @@ def budget_table(budget: SetupBudget) -> Table:
         ("dots' places", "dots_mm"),
     )
     for name, part in parts:
-        rows.append((name, _rms([getattr(p, part) for p in budget.predicted]) / height, None))
-    random = [one.random_mm for one in budget.predicted]
+        rows.append((name, _rms([getattr(p, part) for p in known]) / height, None))
+    random = [one.random_mm for one in known]
     rows.append(("these together", _rms(random) / height, _rms(budget.random)))
     for k in np.flatnonzero(budget.uncertainty.sigma):
-        each = [one.parameters_mm[k] for one in budget.predicted]
+        each = [one.parameters_mm[k] for one in known]
         rows.append((QUANTITIES[k].name, _rms(each) / height, _rms(budget.parameters[:, k])))
-    total = [one.total_mm for one in budget.predicted]
+    total = [one.total_mm for one in known]
     by_setup = budget.uncertainty.combined(budget.parameters)
     simulated = float(np.hypot(_rms(budget.random), _rms(by_setup)))
     rows.append(("everything", _rms(total) / height, simulated))
-    percent = [(n, *(None if v is None else 100 * float(v) for v in values)) for n, *values in rows]
-    lost = int(np.isnan(budget.random).sum())
+    percent = [(name, *map(_percent, values)) for name, *values in rows]
     return Table(
         "error_budget",
         f"Error budget of the height, fit, standard uncertainties in % of {height:g} mm: "
-        f"{len(budget.random)} pools like {budget.pool.footprint.width_mm:g} mm wide"
-        + (f", {lost} without a surface" if lost else ""),
+        f"{len(budget.random)} pools about {budget.pool.footprint.width_mm:g} mm wide"
+        + (f", {budget.lost} without a surface" if budget.lost else ""),
         ("source", "predicted_pct", "simulated_pct"),
         tuple(percent),
     )
 
 
 def _rms(values: Sequence[float] | FloatArray) -> float:
-    return float(np.sqrt(np.nanmean(np.square(values))))
+    """Root mean square of the known values; NaN if there are none."""
+    known = np.asarray(values, float)[~np.isnan(values)]
+    return float(np.sqrt(np.mean(np.square(known)))) if len(known) else float("nan")
+
+
+def _percent(value: str | float | None) -> float | None:
+    return 100 * value if isinstance(value, float) and not np.isnan(value) else None

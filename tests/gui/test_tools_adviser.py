@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -159,3 +162,72 @@ def test_setup_page_opens_the_adviser(window: MainWindow, copy_sample: CopySampl
     click(tool.close_button)
     window.do("adviser")
     assert len(window.findChildren(AdviserWindow)) == 1
+
+
+def test_advice_belongs_to_the_session_for_which_it_was_sought(
+    adviser: AdviserWindow, window: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    click(adviser.start_button)
+    qtbot.waitUntil(lambda: adviser.advice is not None and not adviser.working)
+    assert adviser.use_button.isEnabled()
+    found, gtaw = adviser.headline.text(), adviser.workspace.session.path
+    assert window.files.open(copy_sample("thumb_tack"))
+    session = adviser.workspace.session
+    assert session is not None
+    assert adviser.ranges["pools.width_mm"].value() == pytest.approx((8.775, 10.725))
+    assert not adviser.use_button.isEnabled()
+    reason = "This advice was sought for gtaw: press Advise for thumb_tack."
+    assert adviser.use_button.toolTip() == reason
+    assert adviser.headline.text() == f"{reason} {found}"
+    before = session.setup_text
+    adviser.use()
+    assert session.setup_text == before
+    window.do("close")
+    assert not adviser.use_button.isEnabled()
+    assert window.files.open(gtaw)
+    assert adviser.use_button.isEnabled()
+    assert adviser.headline.text() == found
+    session = adviser.workspace.session
+    assert session is not None
+    session.update_setup({"pattern": {"rows": 9, "absent": None}}, "another pattern")
+    adviser.workspace.changed.emit()
+    assert not adviser.use_button.isEnabled()
+    assert "another pattern" in adviser.use_button.toolTip()
+
+
+def test_advice_asks_for_the_pattern_of_the_open_session(adviser: AdviserWindow):
+    session = adviser.workspace.session
+    assert session is not None
+    session.update_setup({"pattern": {"rows": 9, "absent": None}}, "another pattern")
+    assert adviser.values()["pattern"]["rows"] == 9
+
+
+def test_adviser_says_that_it_does_not_advise_on_lines(
+    adviser: AdviserWindow, window: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    click(adviser.start_button)
+    qtbot.waitUntil(lambda: adviser.advice is not None and not adviser.working)
+    click(adviser.close_button)
+    assert window.files.open(copy_sample("five_lines"))
+    window.do("adviser")
+    session = adviser.workspace.session
+    assert session is not None
+    before = session.setup_text
+    assert adviser.headline.text().startswith("The session is of a line pattern")
+    assert "sought for gtaw" in adviser.headline.text()
+    assert not adviser.start_button.isEnabled()
+    assert not adviser.use_button.isEnabled()
+    adviser.start()
+    adviser.use()
+    assert not adviser.working
+    assert session.setup_text == before
+
+
+def test_unknown_uncertainty_is_not_shown_as_a_number(adviser: AdviserWindow, qtbot: QtBot):
+    click(adviser.start_button)
+    qtbot.waitUntil(lambda: adviser.advice is not None)
+    advice = replace(adviser.advice, sigma_mm=math.nan, random_mm=math.nan, pools=12, lost=3)
+    words = adviser_presenter.headline(advice)
+    assert "3 of 12 simulated pools gave no surface" in words
+    assert "±" not in words.partition(":")[0]
+    assert not re.search(r"\b(nan|inf)\b", words)

@@ -183,6 +183,63 @@ def test_impossible_input_is_rejected(analysis: AnalysisWindow, window: MainWind
     assert "missing" in analysis.message.text()
 
 
+def test_budget_of_lines_is_not_offered(
+    analysis: AnalysisWindow, window: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    assert analysis.why.isHidden()
+    run_analysis(analysis, qtbot)
+    click(analysis.close_button)
+    assert window.files.open(copy_sample("five_lines"))
+    window.do("analysis")
+    # Its own set-up has no budget, but that of the dissertation has.
+    assert analysis.setup.value() == analysis_presenter.USUAL
+    assert analysis.why.isHidden()
+    assert analysis.start_button.isEnabled()
+    choose_setup(analysis, analysis_presenter.OPENED)
+    assert not analysis.why.isHidden()
+    assert analysis.why.text().startswith("The session is of a line pattern")
+    assert not analysis.start_button.isEnabled()
+    tick(analysis, analysis_presenter.BUDGET, "CE")
+    assert not analysis.start_button.isEnabled()
+    analysis.start()
+    assert not analysis.working
+    tick(analysis, "CE")
+    assert analysis.why.isHidden()
+    assert analysis.start_button.isEnabled()
+
+
+def choose_setup(tool: AnalysisWindow, which: str) -> None:
+    tool.setup.set_value(which)
+    tool.setup.edited.emit(which)
+
+
+def test_open_window_follows_to_a_session_of_lines(
+    analysis: AnalysisWindow, window: MainWindow, copy_sample: CopySample
+):
+    assert window.files.open(copy_sample("gmaw"))
+    assert analysis.start_button.isEnabled() == analysis.why.isHidden()
+    choose_setup(analysis, analysis_presenter.OPENED)
+    assert not analysis.start_button.isEnabled()
+    assert window.files.open(copy_sample("thumb_tack"))
+    assert analysis.why.isHidden()
+    assert analysis.start_button.isEnabled()
+
+
+def test_assumed_uncertainties_are_those_of_each_part(analysis: AnalysisWindow):
+    words = analysis.words.text()
+    assert "The budget takes the ± of the session's set-up" in words
+    assert "0.1 mm, 0.1° and 0.1 px if it has none" in words
+
+
+def test_budget_of_a_tiny_pool_is_refused(analysis: AnalysisWindow, qtbot: QtBot):
+    for key, size in (("width", 1.0), ("length", 1.0), ("height", 0.05)):
+        analysis.sizes[key].set_value(size)
+    click(analysis.start_button)
+    qtbot.waitUntil(lambda: not analysis.working)
+    assert "none of 2 pools like it gives a surface" in analysis.message.text()
+    assert not analysis.tables
+
+
 def test_default_size_without_a_setup(copy_sample: CopySample, tmp_path: Path):
     assert not analysis_presenter.has_setup(None)
     assert analysis_presenter.expected_mm(None) == (6.0, 7.0, 0.3)

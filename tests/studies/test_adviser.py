@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +10,12 @@ import pytest
 
 from labapp.simulation.forward import trace
 from labapp.simulation.pools import spherical_cap
+from labapp.studies.adviser import search
 from labapp.studies.adviser.bench_limits import BenchLimits, LaserPlace, Place
 from labapp.studies.adviser.check import Check, check, check_text
 from labapp.studies.adviser.expected_pools import ExpectedPools
 from labapp.studies.adviser.height_error import Trial, predicted_errors, simulated_errors
-from labapp.studies.adviser.report import cost_table
+from labapp.studies.adviser.report import advice_table, advice_text, cost_table
 from labapp.studies.adviser.search import Advice, Effort, Sweep, advise, constraint_text
 from labapp.studies.parameter_deviation import NOMINAL
 
@@ -212,6 +214,44 @@ def test_impossible_advice_names_the_broken_constraint() -> None:
     assert np.isnan(advice.error_mm)
     assert advice.best.margins["up"] < 0
     assert constraint_text("up", -2.0) == ("dots on the plate, above and below: 2 mm too little")
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_pools_without_a_surface_are_counted(
+    monkeypatch: pytest.MonkeyPatch, calibrated: bool
+) -> None:
+    def without_one(trial: Trial) -> np.ndarray:
+        found = simulated_errors(trial)
+        if trial.calibrated == calibrated:
+            found[0, 0] = np.inf
+        return found
+
+    monkeypatch.setattr(search, "simulated_errors", without_one)
+    advice = advise(EXPECTED, LIMITS, LITTLE, workers=1)
+    assert advice.possible
+    assert np.isfinite(advice.error_mm)
+    assert np.isnan(advice.random_mm)
+    assert np.isnan(advice.sigma_mm) == calibrated
+    assert (advice.pools, advice.lost) == (2, 1)
+    words = advice_text(advice)
+    assert "1 of 2 simulated pools gave no surface" in words
+    assert not re.search(r"\b(nan|inf)\b", words)
+
+
+def test_unknown_errors_have_empty_cells(advice: Advice) -> None:
+    sweeps = tuple(replace(one, error_mm=np.full(len(one.value), np.inf)) for one in advice.sweeps)
+    unknown = replace(advice, sweeps=sweeps)
+    for table in (advice_table(unknown), cost_table(unknown)):
+        assert not re.search(r"\b(nan|inf)\b", table.csv())
+
+
+def test_check_counts_the_pools_without_a_surface(checked: Check) -> None:
+    chosen = checked.chosen.copy()
+    chosen[0, 0, 0] = np.inf
+    errors, rematch = np.full(2, np.inf), np.full((2, 3, 1), np.inf)
+    words = check_text(replace(checked, chosen=chosen, errors=errors, rematch=rematch))
+    assert "1 times no surface" in words.splitlines()[1]
+    assert not re.search(r"\b(nan|inf)\b", words)
 
 
 def test_exception_in_progress_ends_the_search() -> None:

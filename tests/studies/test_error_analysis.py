@@ -16,7 +16,7 @@ from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.parallel import in_parallel
 from labapp.simulation.pools import caps_8_3_1, egg, spherical_cap
 from labapp.studies import error_analysis, image_error, parameter_deviation
-from labapp.studies.adviser.predicted_error import DOT_SIGMA_MM, predict_error
+from labapp.studies.adviser.predicted_error import DOT_SIGMA_MM, PredictedError, predict_error
 from labapp.studies.error_analysis import ErrorSurvey, error_table, off_centre, survey
 from labapp.studies.image_error import BENCH, TACK, TACK_RIG, VIEW, axes_of, exactly_seen
 from labapp.studies.parameter_deviation import move, nominal
@@ -239,7 +239,26 @@ def test_budget_table_adds_up_in_squares() -> None:
     assert len(uncertain) == 11
     parts = [rows[name][0] for name in uncertain] + [rows["these together"][0]]
     assert rows["everything"][0] == pytest.approx(np.linalg.norm(parts))
-    assert "1 without a surface" in table.caption
+    assert table.caption.endswith(": 3 pools about 6 mm wide, 1 without a surface")
+
+
+@pytest.mark.filterwarnings("error")
+def test_budget_of_pools_with_too_few_dots_has_no_infinite_parts() -> None:
+    known, pool = nominal(axes_of(VIEW)), spherical_cap(6.0, 0.3)
+    tiny = predict_error(spherical_cap(1.0, 0.05), BENCH, uncertainty=known)
+    good = predict_error(pool, BENCH, uncertainty=known)
+    lost, none = np.full(2, np.nan), np.full((1, len(QUANTITIES)), np.nan)
+
+    def rows(*predicted: PredictedError) -> dict[object, tuple[object, ...]]:
+        table = budget_table(SetupBudget(pool, known, predicted, lost, none))
+        assert "2 without a surface" in table.caption
+        return {row[0]: row[1:] for row in table.rows}
+
+    of_one, of_none = rows(good, tiny), rows(tiny, tiny)
+    assert of_one["everything"] == (pytest.approx(100 * good.total_mm / 0.3), None)
+    part = 100 * abs(good.parameters_mm[0]) / 0.3
+    assert of_one[QUANTITIES[0].name] == (pytest.approx(part), None)
+    assert set(of_none.values()) == {(None, None)}
 
 
 # --- on all cores -----------------------------------------------------------------------------

@@ -206,8 +206,21 @@ def _plane(facts: Facts) -> State:
     )
 
 
+NO_BENCH_CHECK = (
+    "The session is of a line pattern, and the bench check is for a pattern of dots: go on to the "
+    "next step"
+)
+
+
+def no_bench_check(session: Session | None) -> str:
+    """Reason why a session's bench cannot be checked; empty if it can."""
+    return NO_BENCH_CHECK if session is not None and session.has_lines else ""
+
+
 def _bench_check(facts: Facts) -> State:
     kept = facts.session.bench_check
+    if why := no_bench_check(facts.session):
+        return State(Mark.TODO, why)
     if facts.problems:
         return State(Mark.TODO, f"Set-up: {facts.to_do}")
     if facts.checked:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtWidgets import QTabWidget, QVBoxLayout, QWidget
@@ -11,7 +12,7 @@ from labapp.gui.tools import adviser_presenter as presenter
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
-from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.widgets.labels import allow, wrapping_label
 from labapp.gui.widgets.layouts import Group, fill, scrolled
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.sheet import Sheet
@@ -51,6 +52,10 @@ NUMBERS = (
 )
 
 
+START_TIP = "Search for the set-up with the least error of the height"
+USE_TIP = "Apply this set-up to the session; undo restores the former one"
+
+
 class AdviserWindow(ToolWindow):
     """Asks for pools and limits, searches a set-up, and offers it to the session."""
 
@@ -59,9 +64,11 @@ class AdviserWindow(ToolWindow):
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
         self.advice: Advice | None = None
+        self._sought_for: Path | None = None
         self._basis: object = None
         self._asked: presenter.Values = {}
         super().__init__(sessions, window)
+        self.workspace.opened.connect(self._follow_session)
 
     def _make_form(self) -> None:
         self.ranges: dict[str, RangeField] = {}
@@ -88,7 +95,7 @@ class AdviserWindow(ToolWindow):
         self.form.add(self.effort)
 
     def _make_results(self) -> None:
-        self.headline = wrapping_label("Enter pools and limits, then press Advise.")
+        self.headline = wrapping_label()
         self.place = ResultTable("Recommended set-up")
         self.kept = ResultTable("Constraints, and their margins")
         self.costs = CellTable("Added error per mm and degree")
@@ -111,12 +118,10 @@ class AdviserWindow(ToolWindow):
         )
         self.use_button = self.add_button(
             "Apply",
-            "Apply this set-up to the session; undo restores the former one",
+            USE_TIP,
             self.use,
         )
-        self.start_button = self.add_button(
-            "Advise", "Search for the set-up with the least error of the height", self.start
-        )
+        self.start_button = self.add_button("Advise", START_TIP, self.start)
 
     # --- asking ------------------------------------------------------------------------------
 
@@ -138,6 +143,7 @@ class AdviserWindow(ToolWindow):
     def values(self) -> presenter.Values:
         """The request in the fields."""
         flush_fields(self.form)
+        self._ask_for_bench()
         values = {table: dict(keys) for table, keys in self._asked.items()}
         values["pools"]["kind"] = self.kind.value()
         for key, field in self.ranges.items():
@@ -148,8 +154,25 @@ class AdviserWindow(ToolWindow):
             values[table][name] = number.value()
         return values
 
+    def _ask_for_bench(self) -> None:
+        """Ask for pattern and calibration of the session, which have no fields."""
+        now = self.workspace.run_or_report(lambda: presenter.question(self.workspace.session))
+        if now is not None:
+            shown = {table: self._asked[table] for table in ("pools", "bench")}
+            self._asked = {**now, **shown}
+
+    def _follow_session(self) -> None:
+        """Ask for the pool and bench of another session, even if the window is already open."""
+        if self.isVisible():
+            self.prefill()
+            self.show_state()
+
     def start(self) -> None:
         """Search in the background."""
+        session = self.workspace.session
+        if presenter.why_not_advised(session):
+            return
+        sought_for = None if session is None else session.path
         request = self.workspace.run_or_report(lambda: parse_request(self.values(), "the adviser"))
         if request is None:
             return
@@ -159,15 +182,17 @@ class AdviserWindow(ToolWindow):
             advice = advise(*request, effort, progress=progress_of(control))
             return advice, advice_files(advice)
 
-        self.begin("Advising", work, lambda found: self.show_advice(*found))
+        def found(made: tuple[Advice, dict[str, bytes]]) -> None:
+            self._sought_for = sought_for
+            self.show_advice(*made)
+
+        self.begin("Advising", work, found)
 
     # --- what was found ------------------------------------------------------------------------
 
     def show_advice(self, advice: Advice, files: dict[str, bytes]) -> None:
         """Show an advice, and enable saving of its files."""
         self.advice, self.files = advice, files
-        words = presenter.headline(advice)
-        self.headline.setText(words)
         self.place.set_rows(presenter.place_rows(advice))
         self.kept.set_rows(presenter.kept_rows(advice))
         if advice.possible:
@@ -176,22 +201,35 @@ class AdviserWindow(ToolWindow):
             self.costs.setFixedHeight(self.costs.full_height + bar)  # the surrounding area scrolls
         for group, shown in zip(self.groups, (True, True, advice.possible), strict=True):
             group.setVisible(shown)
-        self.sheet.show_png(files["advice.png"], words)
+        self.sheet.show_png(files["advice.png"], presenter.headline(advice))
         self.say("Done")
         self.show_state()
 
     def show_state(self) -> None:
         """Enable the actions that are available now."""
         session, advice = self.workspace.session, self.advice
+        lines, other = presenter.why_not_advised(session), ""
+        words = "" if lines else "Enter pools and limits, then press Advise."
+        if advice is not None:
+            other = presenter.why_not_applied(session, advice, self._sought_for)
+            words = presenter.headline(advice)
+        self.headline.setText(" ".join(filter(None, (lines, other, words))))
+        allow(self.start_button, START_TIP, lines)
+        self.start_button.setEnabled(not self.working and not lines)
+        allow(self.use_button, USE_TIP, lines or other)
         writable = session is not None and not session.read_only
-        self.start_button.setEnabled(not self.working)
-        self.use_button.setEnabled(writable and advice is not None and advice.possible)
+        possible = writable and advice is not None and advice.possible
+        self.use_button.setEnabled(possible and not lines and not other)
         self.save_button.setEnabled(bool(self.files))
 
     def use(self) -> None:
         """Use the recommended set-up in the session."""
-        advice = self.advice
-        if advice is not None and self.workspace.attempt(lambda s: presenter.use(s, advice)):
+        advice, session = self.advice, self.workspace.session
+        if advice is None or presenter.why_not_advised(session):
+            return
+        if presenter.why_not_applied(session, advice, self._sought_for):
+            return
+        if self.workspace.attempt(lambda s: presenter.use(s, advice)):
             self.workspace.notified.emit(
                 "The advised set-up is applied: calibrate laser and plane in steps 2 and 3", False
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from labapp.config.setup import pattern_values
@@ -12,13 +13,15 @@ from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM
 from labapp.studies.adviser.bench_limits import CONSTRAINTS, BenchLimits
 from labapp.studies.adviser.files import advised_setup
 from labapp.studies.adviser.keys import calibration_values
-from labapp.studies.adviser.report import WORDS
+from labapp.studies.adviser.report import WORDS, error_words, unknown_words
 from labapp.studies.adviser.search import Advice
 
 USUAL_HEIGHT_MM = 0.25
 
 ABOUT = 0.1
 """Relative range of pool sizes around that of the session."""
+
+LINES = "The session is of a line pattern, and the adviser plans a bench for a pattern of dots."
 
 Values = dict[str, dict[str, Any]]
 """Table → key → value, as required by `studies.adviser.keys.parse_request`."""
@@ -51,7 +54,7 @@ def question(session: Session | None) -> Values:
             "electrode_height_mm": usual.electrode_mm,
         },
     }
-    found = None if session is None else rig(session)
+    found = None if session is None or session.has_lines else rig(session)
     if found is not None:
         bench = values["bench"]
         for key, value in (
@@ -73,15 +76,36 @@ def _about(size_mm: float) -> list[float]:
     return [round(size_mm * (1 - ABOUT), 3), round(size_mm * (1 + ABOUT), 3)]
 
 
+def why_not_advised(session: Session | None) -> str:
+    """Reason why no advice can be sought; empty if it can."""
+    return LINES if session is not None and session.has_lines else ""
+
+
+def why_not_applied(session: Session | None, advice: Advice, sought_for: Path | None) -> str:
+    """Reason why an advice does not concern the open session; empty if it does.
+
+    Parameters
+    ----------
+    sought_for
+        File of the session for which it was sought; None: without a session.
+    """
+    if sought_for != (None if session is None else session.path):
+        of = "without a session" if sought_for is None else f"for {sought_for.stem}"
+        again = ""
+        if session is not None and not session.has_lines:
+            again = f": press Advise for {session.path.stem}"
+        return f"This advice was sought {of}{again}."
+    found = None if session is None or session.has_lines else rig(session)
+    if found is not None and pattern_values(found.pattern) != pattern_values(advice.limits.pattern):
+        return "This advice was sought for another pattern: press Advise again."
+    return ""
+
+
 def headline(advice: Advice) -> str:
-    """The advice in a sentence, or the reason why there is none."""
+    """The advice in a sentence or two, or the reason why there is none."""
     if advice.possible:
-        height = advice.expected.mean_height_mm
-        share = 100 * advice.error_mm / height
-        return (
-            f"Expect a mean height error of {1000 * advice.error_mm:.2f} ± "
-            f"{1000 * advice.sigma_mm:.2f} µm, {share:.2g} % of {height:.3g} mm."
-        )
+        words = f"Expect a mean height error of {error_words(advice)}."
+        return words + unknown_words(advice)
     broken = [CONSTRAINTS[name][0] for name, margin in advice.best.margins.items() if margin < 0]
     return (
         f"No set-up is possible within these limits, because of: {'; '.join(broken)}. "

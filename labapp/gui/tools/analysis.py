@@ -12,7 +12,7 @@ from labapp.gui.tools import analysis_presenter as presenter
 from labapp.gui.tools.analysis_presenter import BUDGET, OPENED, PARTS, USUAL
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, flush_fields
-from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.widgets.labels import allow, show_words, wrapping_label
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 from labapp.studies import SCHEME_NAMES
@@ -35,6 +35,9 @@ SIZES = (
     ("length", "Length", 1.0, 30.0, 0.1, "Of the expected pool, along Y"),
     ("height", "Height", -30.0, 30.0, 0.01, "Of the expected pool; negative for a concave one"),
 )
+
+
+START_TIP = "Compute what is ticked; each part is shown when it is done"
 
 
 class AnalysisWindow(ToolWindow):
@@ -63,6 +66,7 @@ class AnalysisWindow(ToolWindow):
             self.form.add_wide(box)
         self.form.add_heading("Of the budget")
         self.setup = ChoiceField("Set-up", presenter.SETUPS, tooltip="Whose errors are added up")
+        self.setup.edited.connect(lambda _: self.show_state())
         self.form.add(self.setup)
         self.sizes: dict[str, NumberField] = {}
         for key, label, lowest, highest, step, tip in SIZES:
@@ -108,15 +112,19 @@ class AnalysisWindow(ToolWindow):
         line = FieldForm()
         line.add(self.which)
         self.words = wrapping_label(
-            "Tick what is to be computed, then press Run. All of it is simulated; the "
-            "calibration is assumed to be known to 0.1 mm, 0.1° and 0.1 px, a dot to 0.3 px."
+            "Tick what is to be computed, then press Run. All of it is simulated. The budget takes "
+            "the ± of the session's set-up, or 0.1 mm, 0.1° and 0.1 px if it has none; the other "
+            "parts assume these. A dot is known to 0.3 px."
         )
+        self.why = wrapping_label()
+        self.why.hide()
         self.words.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.table = CellTable("Table of the error analysis")
         self.sheet = Sheet("Picture of the error analysis")
         self.stack = QStackedWidget()
         for widget in (self.table, self.sheet):
             self.stack.addWidget(widget)
+        self.results.addWidget(self.why)
         self.results.addWidget(line)
         self.results.addWidget(self.words)
         self.results.addWidget(self.stack, 1)
@@ -128,9 +136,7 @@ class AnalysisWindow(ToolWindow):
         self.add_save_button(
             "Save the results…", "Write all tables (CSV, Markdown) and pictures to a folder"
         )
-        self.start_button = self.add_button(
-            "Run", "Compute what is ticked; each part is shown when it is done", self.start
-        )
+        self.start_button = self.add_button("Run", START_TIP, self.start)
 
     # --- what is to be worked out --------------------------------------------------------------
 
@@ -152,6 +158,8 @@ class AnalysisWindow(ToolWindow):
     def start(self) -> None:
         """Compute the ticked parts in the background, one after the other."""
         flush_fields(self.form)
+        if self._why_not():
+            return
         ticked = tuple(key for key, box in self.parts.items() if box.isChecked())
         scheme = self.scheme.value()
         options = AnalysisOptions(
@@ -173,6 +181,12 @@ class AnalysisWindow(ToolWindow):
 
         self._anew = True
         self.begin("Computing", work, lambda _: self.say("Done"), self.show_part)
+
+    def _why_not(self) -> str:
+        """Reason why what is ticked cannot be computed; empty if it can."""
+        ticked = self.parts[BUDGET].isChecked()
+        of = self.setup.value()
+        return presenter.why_no_budget(self.workspace.session, of) if ticked else ""
 
     def _budget(self) -> tuple[Setup | None, Pool]:
         """Set-up and pool chosen for the budget."""
@@ -216,6 +230,8 @@ class AnalysisWindow(ToolWindow):
 
     def show_state(self) -> None:
         """Enable the actions that are available now."""
-        ticked = any(box.isChecked() for box in self.parts.values())
-        self.start_button.setEnabled(ticked and not self.working)
+        ticked, why = any(box.isChecked() for box in self.parts.values()), self._why_not()
+        show_words(self.why, why)
+        allow(self.start_button, START_TIP, why)
+        self.start_button.setEnabled(ticked and not self.working and not why)
         self.save_button.setEnabled(bool(self.files))

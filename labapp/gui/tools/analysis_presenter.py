@@ -41,9 +41,20 @@ USUAL_MM = (6.0, 7.0, 0.3)
 """Width, length and height of the pool if none is expected, mm."""
 
 
+LINES = (
+    "The session is of a line pattern, which has no error budget: take the set-up of §8.3.1, or "
+    "open a session of dots."
+)
+
+
 def has_setup(session: Session | None) -> bool:
-    """Whether a session has a complete set-up."""
-    return session is not None and not session.setup_problems
+    """Whether a session has a complete set-up of a pattern of dots."""
+    return session is not None and not session.has_lines and not session.setup_problems
+
+
+def why_no_budget(session: Session | None, setup: str) -> str:
+    """Reason why the chosen set-up has no budget; empty if it may have one."""
+    return LINES if setup == OPENED and session is not None and session.has_lines else ""
 
 
 def expected_mm(session: Session | None) -> tuple[float, float, float]:

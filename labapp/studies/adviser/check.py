@@ -49,14 +49,13 @@ class Check(ReadOnlyArrays):
 
     @property
     def error_mm(self) -> float:
-        """Mean error of the recommended set-up."""
-        return float(self.chosen[..., 0].mean())
+        """Mean error of the recommended set-up over the pools that it can measure."""
+        return _mean(self.chosen[..., 0])
 
     @property
     def text_error_mm(self) -> float:
         """Mean error of the set-up of §8.3.1 over the pools that it can measure."""
-        error = self.text[..., 0]
-        return float(error[np.isfinite(error)].mean())
+        return _mean(self.text[..., 0])
 
     @property
     def text_breaks(self) -> tuple[str, ...]:
@@ -115,29 +114,49 @@ def check(
     return Check(advice, own[0], own[1], tuple(rivals), errors, once_more[..., 0])
 
 
+def _mean(errors: FloatArray) -> float:
+    """Mean of the finite errors; NaN if there are none."""
+    finite = errors[np.isfinite(errors)]
+    return float(finite.mean()) if len(finite) else float("nan")
+
+
+def _micro(error_mm: float, lost: int = 0) -> str:
+    """Text of an error, µm, and of the number of measurements without a surface."""
+    words = f"{1000 * error_mm:.2f} µm" if np.isfinite(error_mm) else "unknown"
+    return words + (f", {lost} times no surface" if lost else "")
+
+
+def _percent(ratio: float) -> str:
+    return f"{100 * (ratio - 1):+.1f} %" if np.isfinite(ratio) else "unknown"
+
+
 def check_text(found: Check) -> str:
     """Text of the results of a check."""
-    micro = 1000.0
     hidden, missing = (int(found.chosen[..., k].sum()) for k in (1, 2))
-    lost = int(np.isinf(found.text[..., 0]).sum())
+    lost, text_lost = (int(np.isinf(one[..., 0]).sum()) for one in (found.chosen, found.text))
     pools, places = found.chosen.shape[:2]
     lines = [
         f"{pools} fresh pools at {places} places each: {hidden} rays hidden, "
         f"{missing} off the plane",
-        f"mean height error {micro * found.error_mm:.2f} µm, "
-        f"{100 * found.off_prediction:+.1f} % off the predicted "
-        f"{micro * found.advice.error_mm:.2f} µm",
-        f"set-up of §8.3.1: {micro * found.text_error_mm:.2f} µm"
-        + (f", {lost} times no surface" if lost else "")
+        f"mean height error {_micro(found.error_mm)}, "
+        f"{_percent(found.off_prediction + 1)} off the predicted "
+        f"{_micro(found.advice.error_mm, lost)}",
+        f"set-up of §8.3.1: {_micro(found.text_error_mm, text_lost)}"
         + "".join(f"; {words}" for words in found.text_breaks),
     ]
     if found.places:
         least = float(found.errors.min())
-        own, rival = found.rematch.mean(axis=(1, 2))
+        own, rival = found.rematch.mean(axis=(1, 2)).tolist()
         lines += [
-            f"best of {len(found.places)} possible set-ups of a grid: {micro * least:.2f} µm "
-            f"({100 * (least / found.error_mm - 1):+.1f} %)",
-            f"those two on as many pools more: {micro * own:.2f} and "
-            f"{micro * rival:.2f} µm ({100 * (rival / own - 1):+.1f} %)",
+            f"best of {len(found.places)} possible set-ups of a grid: {_micro(least)} "
+            f"({_percent(_ratio(least, found.error_mm))})",
+            f"those two on as many pools more: {_micro(own).removesuffix(' µm')} and "
+            f"{_micro(rival)} ({_percent(_ratio(rival, own))})",
         ]
     return "\n".join(lines)
+
+
+def _ratio(error_mm: float, other_mm: float) -> float:
+    """Ratio of two errors; NaN if either is infinite."""
+    both = np.isfinite([error_mm, other_mm]).all()
+    return error_mm / other_mm if both else float("nan")

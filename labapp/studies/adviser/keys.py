@@ -20,6 +20,7 @@ from labapp.config.toml_keys import (
     unknown_key,
     within,
 )
+from labapp.core.geometry.line_pattern import KIND as LINES
 from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, POINTS, QUANTITIES, RigUncertainty
 from labapp.errors import InputError
 from labapp.studies.adviser.bench_limits import BenchLimits
@@ -131,7 +132,10 @@ def parse_request(
     path = Path(source)
     problems = [unknown_key(path, key, TABLES) for key in values if key not in TABLES]
     for name, rules in TABLES.items():
-        if name == "pools" or name in values:
+        if name == "pattern" and _is_of_lines(values.get(name)):
+            right = "a pattern of dots: square, hexagonal or directions"
+            problems.append(InputError(path, "pattern.kind", f'"{LINES}"', right))
+        elif name == "pools" or name in values:
             problems += check_keys(path, name, values.get(name), rules)
     if problems:
         raise InputError.gather(problems)
@@ -153,6 +157,11 @@ def parse_request(
     except ValueError as error:
         key, _, why = str(error).partition(": ")
         raise InputError(path, f"pools.{key}", values["pools"].get(key), why) from error
+
+
+def _is_of_lines(pattern: object) -> bool:
+    """Whether a table ``[pattern]`` is of lines, for which there is no advice."""
+    return isinstance(pattern, dict) and pattern.get("kind") == LINES
 
 
 def _limits(tables: dict[str, dict[str, Any]]) -> BenchLimits:

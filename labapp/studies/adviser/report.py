@@ -29,15 +29,13 @@ def advice_text(advice: Advice) -> str:
     """The recommended set-up, its expected error and its margins, as Markdown."""
     best = advice.best
     if advice.possible:
-        height = advice.expected.mean_height_mm
         lines = [
             "Recommended set-up:",
             "",
             *_place_lines(best),
             "",
-            f"Expected mean height error: {_micro(advice.error_mm)} ± "
-            f"{_micro(advice.sigma_mm)} µm, {100 * advice.error_mm / height:.2g} % of "
-            f"{height:.3g} mm; {_micro(advice.random_mm)} µm with the calibration known exactly.",
+            f"Expected mean height error: {error_words(advice)}{_exact_words(advice)}."
+            f"{unknown_words(advice)}",
             "",
             "Its margins:",
             "",
@@ -69,6 +67,30 @@ def _place_lines(candidate: Candidate) -> list[str]:
     ]
 
 
+def error_words(advice: Advice) -> str:
+    """Expected mean error of a possible set-up, with its ± if this is known."""
+    height = advice.expected.mean_height_mm
+    sigma = f" ± {_micro(advice.sigma_mm)}" if np.isfinite(advice.sigma_mm) else ""
+    share = f"{100 * advice.error_mm / height:.2g} % of {height:.3g} mm"
+    return f"{_micro(advice.error_mm)}{sigma} µm, {share}"
+
+
+def _exact_words(advice: Advice) -> str:
+    if not np.isfinite(advice.random_mm):
+        return ""
+    return f"; {_micro(advice.random_mm)} µm with the calibration known exactly"
+
+
+def unknown_words(advice: Advice) -> str:
+    """A sentence, after a space, about what pools without a surface leave unknown; or nothing."""
+    if not advice.lost:
+        return ""
+    counts = f" {advice.lost} of {advice.pools} simulated pools gave no surface"
+    if np.isfinite(advice.sigma_mm):
+        return f"{counts} with the calibration known exactly: the error with it is unknown."
+    return f"{counts}: the error is only predicted, and its ± unknown."
+
+
 def _micro(value_mm: float) -> str:
     return f"{1000 * value_mm:.2f}"
 
@@ -83,7 +105,8 @@ def advice_table(advice: Advice) -> Table:
         for value, error, margins in zip(sweep.value, sweep.error_mm, sweep.margins, strict=True):
             place = {name: getattr(advice.best.place, name) for name in MOVED}
             place[sweep.name] = float(value)
-            rows.append(("away", *place.values(), float(error), *margins.values()))
+            known = float(error) if np.isfinite(error) else None
+            rows.append(("away", *place.values(), known, *margins.values()))
     columns = [f"{name}_margin_{unit}" for name, (_, unit) in CONSTRAINTS.items()]
     return Table(
         "advice",
@@ -114,7 +137,8 @@ def cost_table(advice: Advice) -> Table:
             more = None
             if end is not None:
                 apart = abs(sweep.value[end] - sweep.value[own])
-                more = float(1000 * (sweep.error_mm[end] - sweep.error_mm[own]) / apart)
+                if np.isfinite(sweep.error_mm[[own, end]]).all():
+                    more = float(1000 * (sweep.error_mm[end] - sweep.error_mm[own]) / apart)
             wrong = broken[0] if broken else None
             rows.append(
                 (

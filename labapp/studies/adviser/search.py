@@ -111,14 +111,19 @@ class Advice:
     error_mm: float
     sigma_mm: float
     """Expected mean error of its height, and the standard uncertainty of that mean; NaN if no
-    set-up is feasible.
+    set-up is feasible. The latter is NaN, too, if a simulated pool gave no surface with each of
+    the finalists: the error is then only predicted.
     """
     random_mm: float
-    """The same mean with the calibration known exactly."""
+    """The same mean with the calibration known exactly; NaN if a simulated pool gave no surface."""
     grid: tuple[Candidate, ...]
     """The positions of the grid, one laser position after the other."""
     sweeps: tuple[Sweep, ...]
     """Sensitivity to each quantity."""
+    pools: int = 0
+    """Number of pools simulated with the recommended set-up."""
+    lost: int = 0
+    """Number of those that gave no surface, with the calibration's errors or without them."""
 
     @property
     def possible(self) -> bool:
@@ -164,10 +169,9 @@ def _found(search: _Search) -> Advice:
     by_place = {one.place: one for one in scored}
     grid = tuple(by_place.get(one.place, one) for one in grid)
     finalists = search.refined(search.scored(_best(scored, 10), 1))
-    best, error, sigma, random = search.decided(finalists)
-    scale = error / best.error_mm
-    sweeps = search.sweeps(best, scale)
-    return Advice(expected, limits, best, error, sigma, random, grid, sweeps)
+    best, errors, *counts = search.decided(finalists)
+    sweeps = search.sweeps(best, errors[0] / best.error_mm)
+    return Advice(expected, limits, best, *errors, grid, sweeps, *counts)
 
 
 def _best(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
@@ -225,8 +229,13 @@ class _Search:
         """The set-up with the least violation, starting from the grid's."""
         return _refined_locally((self.expected, self.limits, start, None, 3 * self.effort.steps))
 
-    def decided(self, finalists: list[Candidate]) -> tuple[Candidate, float, float, float]:
-        """Simulate the finalists; returns the best, its mean error, the σ of it, its random part.
+    def decided(
+        self, finalists: list[Candidate]
+    ) -> tuple[Candidate, tuple[float, float, float], int, int]:
+        """Simulate the finalists; see `Advice` for what is returned of the best.
+
+        Returns the best, its (mean error, σ of that, random part), and the numbers of its pools
+        and of those without a surface.
 
         Each simulated mean still varies by a tenth with the drawn pools. The prediction, corrected
         by one factor for all finalists, does not, but does not cover everything. Therefore the
@@ -242,15 +251,19 @@ class _Search:
         kept = np.isfinite(simulated)
         if not kept.any():
             # Some pool has no surface with any set-up: only the prediction is left.
-            best = int(predicted.argmin())
-            return finalists[best], float(predicted[best]), float("inf"), float("nan")
+            best, unknown = int(predicted.argmin()), float("nan")
+            lost = int(np.isinf(errors[best]).sum())
+            only = (float(predicted[best]), unknown, unknown)
+            return finalists[best], only, errors.shape[1], lost
         factor = np.exp(np.log(simulated[kept] / predicted[kept]).mean())
         both = np.where(kept, np.sqrt(simulated * factor * predicted), np.inf)
         best = int(both.argmin())
         sigma = errors[best].std(ddof=1) / np.sqrt(errors.shape[1])
         exact = trials_in_blocks(self.limits, [finalists[best].place], sample, 8, calibrated=False)
         random = np.concatenate(in_parallel(simulated_errors, exact, "exact calibration", *tell))
-        return finalists[best], float(both[best]), float(sigma), float(random[:, 0].mean())
+        lost = int(np.isinf(random[:, 0]).sum())
+        mean = float("nan") if lost else float(random[:, 0].mean())
+        return finalists[best], (float(both[best]), float(sigma), mean), errors.shape[1], lost
 
     def sweeps(self, best: Candidate, scale: float) -> tuple[Sweep, ...]:
         tasks = [
@@ -285,7 +298,7 @@ def grid_of(
         (expected, limits, float(angle), float(distance), planes)
         for angle, distance in product(angles, distances)
     ]
-    found = in_parallel(_at_planes, tasks, "which are possible", progress, workers)
+    found = in_parallel(_at_planes, tasks, "finding possible set-ups", progress, workers)
     return tuple(one for some in found for one in some)
 
 

@@ -386,6 +386,29 @@ def test_rejected_check_shows_suspects_and_no_measured_mirror(
     assert page.state(states(None)["bench_check"]) == states(None)["bench_check"]
 
 
+def test_lines_are_not_checked(page: BenchCheckPage, copy_sample: Callable[[str], Path]) -> None:
+    plain, dots = states(page.session)["bench_check"], page.session.path
+    page.workspace.show(Session.open(copy_sample("five_lines")))
+    found = page.state(states(page.session)["bench_check"])
+    assert found.mark is Mark.TODO
+    assert found.why.startswith("The session is of a line pattern")
+    lead = page.lead(None)
+    assert lead is not None
+    assert (lead.words, lead.actions) == (found.why, ())
+    for widget in (page.add_button, page.check_button, page.predict_button, page.use_button):
+        assert not widget.isEnabled()
+        assert widget.toolTip() == found.why
+    dropped = page.workspace.folder / "mirror.png"
+    assert page.takes_files([dropped])
+    assert not page.workspace.tasks.active
+    assert found.why in page.answer.text()
+    page.workspace.show(Session.open(dots))
+    assert states(page.session)["bench_check"] == plain
+    assert page.add_button.isEnabled()
+    assert page.predict_button.isEnabled()
+    assert page.answer.text() == ""
+
+
 def test_table_moves_below_the_picture_in_a_narrow_page(
     page: BenchCheckPage,
 ) -> None:

@@ -107,6 +107,36 @@ def test_recording_facts(copy_sample) -> None:
     assert [part for part, _ in blank] == [0, 0, 0]
 
 
+def test_exposure_of_lines_is_not_judged_as_that_of_dots(copy_sample) -> None:
+    for name in ("five_lines", "gmaw"):
+        with Session.open(copy_sample(name), read_only=True) as session:
+            shown = look(session, 11)
+        assert shown.image is not None
+        assert shown.exposure is None
+
+
+def test_exposure_of_dots_is_hidden_once_lines_are_open(copy_sample, qtbot: QtBot) -> None:
+    workspace = Workspace()
+    workspace.show(Session.open(copy_sample("gtaw"), read_only=True))
+    page = make_page(workspace)
+    qtbot.waitUntil(lambda: page.exposure.verdict.text().startswith("● Good."))
+    recording = copy_sample("five_lines")
+    workspace.show(Session.open(recording, read_only=True))
+    page.refresh()
+    qtbot.waitUntil(page.exposure.isHidden)
+    qtbot.waitUntil(lambda: page.picture_view.picture is not None)
+    qtbot.waitUntil(lambda: not workspace.tasks.active)
+    page._judge()
+    qtbot.waitUntil(lambda: not workspace.tasks.active)
+    assert page.exposure.isHidden()
+    page.take(recording.parent / "recording.avi")
+    qtbot.waitUntil(lambda: page.preview is not None and not workspace.tasks.active)
+    page._judge()
+    qtbot.waitUntil(lambda: not workspace.tasks.active)
+    assert page.exposure.isHidden()
+    workspace.close()
+
+
 def test_missing_recording_is_reported_by_frames(copy_sample) -> None:
     path = copy_sample("gtaw")
     (path.parent / "recording.avi").rename(path.parent / "moved.avi")

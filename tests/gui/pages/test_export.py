@@ -135,9 +135,13 @@ def test_plan_of_lines_lists_what_is_written(copy_sample, tmp_path: Path) -> Non
         assert planned.locked.startswith("Lines")
         assert planned.notes[0] == planned.locked
         assert not any("film" in note for note in planned.notes)
+        failed = "20 frames that could not be measured: in features.csv with their status."
+        assert failed in planned.notes
         frames = planned.frames.tolist()
         written = write(session, everything, frames, tmp_path / "out", lambda *_: None)
     assert written.problems == ()
+    rows = (tmp_path / "out" / "features.csv").read_text("utf-8").splitlines()
+    assert len(rows) == 1 + len(frames) == 65
     names = [file.name for file in written.files]
     tables = [name for name in names if not name.startswith("surface_")]
     assert tables == sorted(["features.csv", "lines.csv", "line_points.csv"])

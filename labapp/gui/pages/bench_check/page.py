@@ -22,7 +22,7 @@ from labapp.gui.pages.bench_check.listed_picture import ListedPicture, kept_pict
 from labapp.gui.pages.bench_check.mirror_form import MirrorForm
 from labapp.gui.pages.bench_check.presenter import COLUMNS, CheckResult, Predicted
 from labapp.gui.pages.page import Page
-from labapp.gui.shell.steps import Lead, Mark, Offer, State, setup_to_do
+from labapp.gui.shell.steps import Lead, Mark, Offer, State, no_bench_check, setup_to_do
 from labapp.gui.tasks import Control
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
@@ -114,6 +114,11 @@ class BenchCheckPage(Page):
                 self._take_kept()
         self._follow()
 
+    @property
+    def locked(self) -> str:
+        """Reason why nothing can be checked or changed; empty if it can."""
+        return no_bench_check(self.workspace.session) or super().locked
+
     def state(self, found: State) -> State:
         """State of the step, which may have a check that is not yet in use."""
         made, session = self.checked, self.workspace.session
@@ -126,7 +131,9 @@ class BenchCheckPage(Page):
         return State(Mark.ATTENTION, "The pictures contradict the set-up")
 
     def lead(self, found: Lead | None) -> Lead | None:
-        """Sources of a picture while there is none."""
+        """Sources of a picture while there is none; for lines the reason why none is needed."""
+        if why := no_bench_check(self.workspace.session):
+            return Lead(why, ())
         add = Offer("&Add picture…", "Of a mirror of known shape", self._choose)
         return found if self.chosen else Lead(NO_PICTURE, (add,))
 
@@ -162,6 +169,9 @@ class BenchCheckPage(Page):
     def takes_files(self, paths: Sequence[Path]) -> bool:
         """Add dropped pictures."""
         pictures = [path for path in paths if path.suffix.lower() in presenter.PICTURES]
+        if why := no_bench_check(self.workspace.session):
+            self._answer_in(self.answer).setText(why)
+            return len(pictures) == len(paths)
         if self.locked or len(pictures) < len(paths):
             return False
         self.load(*pictures)

@@ -19,6 +19,7 @@ from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
     ShownFrame,
+    judged_by,
     look,
     missing_text,
     recording_facts,
@@ -216,7 +217,8 @@ class CapturePage(Page):
         self.title.setText(seen.title)
         self.picture_view.show_picture(seen.image, seen.words)
         if seen.exposure is None:
-            if seen.image is None:
+            session = self.workspace.session
+            if seen.image is None or session is None or judged_by(session) is None:
                 self.exposure.hide()
             return  # the previous frame's exposure stays until this one is assessed
         self.exposure.show()
@@ -255,7 +257,7 @@ class CapturePage(Page):
 
         def work(_: Control) -> ShownFrame:
             if preview is not None:
-                return preview.look(number, session.settings.dots if judged else None)
+                return preview.look(number, judged_by(session) if judged else None)
             return look(session, number, judged)
 
         def done(seen: ShownFrame) -> None:
@@ -266,7 +268,7 @@ class CapturePage(Page):
                 self._show_seen(seen)
             if self._wanted not in (None, wanted):
                 self._read()
-            elif not judged and seen.image is not None:
+            elif not judged and seen.image is not None and judged_by(session) is not None:
                 self._rest.start()
 
         self._reading = self.workspace.tasks.start("Reading a frame", work, done)

@@ -68,7 +68,7 @@ class Preview:
 
 
 def look(session: Session, number: int, judged: bool = True) -> ShownFrame:
-    """Read a frame of the session and, if ``judged``, assess its exposure."""
+    """Read a frame of the session and, if ``judged`` and of dots, assess its exposure."""
     recording = session.recording
     title = f"Frame {number} of the session"
     try:
@@ -76,9 +76,13 @@ def look(session: Session, number: int, judged: bool = True) -> ShownFrame:
     except InputError as error:
         return ShownFrame(title, None, None, recording_gone(session) or str(error))
     depth = None if recording is None else recording.bit_depth
-    return ShownFrame(
-        title, image, _judged(image, session.settings.dots if judged else None, depth)
-    )
+    settings = judged_by(session) if judged else None
+    return ShownFrame(title, image, _judged(image, settings, depth))
+
+
+def judged_by(session: Session) -> DotSettings | None:
+    """Settings by which exposures are assessed; None for lines, which are not judged as dots."""
+    return None if session.has_lines else session.settings.dots
 
 
 def _judged(

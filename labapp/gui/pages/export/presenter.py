@@ -225,7 +225,8 @@ def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
         )
     if failed := sum(map(is_failed, status[measured])):
         why = "without a surface: in the tables with the reason"
-        words = "that could not be measured: left out" if locked else why
+        of_lines = "that could not be measured: in features.csv with their status"
+        words = of_lines if locked else why
         notes.append(f"{pluralize(failed, 'frame')} {words}.")
     if "film" in request.some("pictures") and surfaces:
         notes.append(film_note(seen.frame[measured], seen.time_s[measured], request.film_rate_hz))
