@@ -17,6 +17,7 @@ from labapp.gui.shell.window import MainWindow
 from labapp.gui.tasks import Control
 from labapp.gui.tools import study as study_window
 from labapp.gui.tools.study import StudyWindow
+from labapp.run import measurers
 from labapp.run.study.study import Study
 from labapp.session.session import Session
 from labapp.simulated.benchmark import scenario_text
@@ -43,6 +44,12 @@ def file(simulated: Path, tmp_path: Path) -> Path:
     """A study of one recording."""
     shutil.copytree(simulated, tmp_path / "bench")
     return write(tmp_path / "study.toml")
+
+
+@pytest.fixture
+def short_stretches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Divide recordings into stretches of three frames."""
+    monkeypatch.setattr(measurers, "STRETCH", 3)
 
 
 @pytest.fixture
@@ -110,7 +117,7 @@ def test_session_is_made_anew_after_the_study_was_changed(
 
 
 def test_partial_session_is_completed(
-    tool: StudyWindow, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+    short_stretches: None, tool: StudyWindow, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
     def cancelled(control: Control) -> Progress:
         def progress(what: str, done: int, total: int) -> None:
