@@ -192,3 +192,17 @@ def test_proposed_folder_does_not_exist_yet(tmp_path: Path):
     (tmp_path / "egg").mkdir()
     (tmp_path / "egg 2").mkdir()
     assert new_path(tmp_path, "egg", suffix="") == tmp_path / "egg 3"
+
+
+def test_typed_seed_and_frames_stay_when_the_window_is_closed_while_it_draws(
+    simulator: SimulatorWindow, qtbot: QtBot
+):
+    simulator.frames.set_value(4)
+    simulator.seed.set_value(77)
+    simulator.seed.edited.emit(77)
+    assert simulator.preview is None
+    simulator.close()
+    simulator.open_beside()
+    qtbot.waitUntil(lambda: simulator.preview is not None)
+    assert (simulator.frames.value(), simulator.seed.value()) == (4, 77)
+    assert simulator.preview.scenario.recording.seed == 77

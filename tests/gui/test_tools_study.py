@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PySide6.QtCore import QMimeData, QPoint, QPointF, Qt, QUrl
@@ -13,9 +15,13 @@ from PySide6.QtWidgets import QApplication, QPushButton
 from pytestqt.qtbot import QtBot
 
 from labapp.config.scenario import read_scenario
+from labapp.core.surface.measures import SIZES
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools.study import StudyWindow
 from labapp.run.study.plan import write_study
+from labapp.run.study.status import StudyProgress
+from labapp.run.study.study import Study
+from labapp.run.study.summary import GroupSummary, Mean, RecordingSummary, StudySummary
 from labapp.simulated.benchmark import scenario_text
 from labapp.simulated.simulate import simulate
 from labapp.studies.tables import Table
@@ -24,6 +30,7 @@ from tests.waiting import PATIENCE_S
 pytestmark = pytest.mark.slow
 
 PATIENCE_MS = round(1000 * PATIENCE_S)
+RIGHT = Qt.AlignmentFlag.AlignRight
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +124,7 @@ def test_study_is_created_and_run_and_a_recording_opened(
     window.do("study")
     assert study.isVisible()
     assert study.list.selectedItems()
+    assert study.open_button.isEnabled()
 
 
 def test_dropped_files_are_opened_or_filled_in(
@@ -185,3 +193,79 @@ def test_invalid_studies_are_rejected(study: StudyWindow, recordings: Path, tmp_
     study.make(tmp_path / "new.toml")
     assert "none.toml" in study.message.text()
     assert not (tmp_path / "new.toml").exists()
+
+
+def one_recording(recordings: Path) -> Path:
+    """Write a study of one recording, without conditions: its table is smaller."""
+    path = recordings / "other.toml"
+    text = 'setup = "I80_1/setup.toml"\n[[recording]]\nfile = "I80_1/recording.avi"\n'
+    path.write_text(text, "utf-8")
+    return path
+
+
+def names(tool: StudyWindow) -> list[str]:
+    return [one.recording.name for one in tool.found]
+
+
+def test_another_study_is_opened_while_a_recording_is_selected(
+    study: StudyWindow, recordings: Path, qtbot: QtBot
+):
+    make(study, recordings, qtbot)
+    study.list.selectRow(0)
+    study.show_study(one_recording(recordings))
+    qtbot.waitUntil(lambda: len(study.found) == 1 and is_idle(study), timeout=PATIENCE_MS)
+    assert not study.list.selectedItems()
+    assert study.message.text().endswith("other.toml")
+
+
+def test_plots_of_another_study_are_not_shown(study: StudyWindow, recordings: Path, qtbot: QtBot):
+    make(study, recordings, qtbot)
+    means = dict.fromkeys(SIZES, Mean(5.0, 0.1, 0.1, 0.1, 0.1, 3))
+    name = study.found[0].recording.name
+    one = RecordingSummary(study.found[0], {"ok": 3}, "", "", means)
+    group = GroupSummary({"current_a": 80.0}, (name,), 3, means)
+    study._show_summary(StudySummary("study", ("current_a",), (one,), (group,), ()))
+    assert not study.sheet._printed.isNull()
+    study.show_study(one_recording(recordings))
+    assert study.sheet._printed.isNull()
+    study._show_summary(StudySummary("study", ("current_a",), (one,), (group,), ()))
+    study._show_summary(StudySummary("other", (), (), (), ()))
+    assert study.sheet._printed.isNull()
+    assert "surface" in study.sheet._paper.text()
+
+
+def test_progress_of_a_run_is_not_shown_in_another_study(
+    study: StudyWindow, recordings: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    other_is_shown, end = threading.Event(), threading.Event()
+
+    def run(self: Study, *_: object, progress: Any, note: Any, **__: object) -> Any:
+        other_is_shown.wait(PATIENCE_S)
+        progress(StudyProgress(1, 6, 0, 3, 0))
+        note("reported")
+        end.wait(PATIENCE_S)
+        return self.status()
+
+    monkeypatch.setattr(Study, "run", run)
+    make(study, recordings, qtbot)
+    click(study.start_button)
+    study.show_study(one_recording(recordings))
+    qtbot.waitUntil(lambda: names(study) == ["recording"], timeout=PATIENCE_MS)
+    with qtbot.waitSignal(study.workspace.notified, timeout=PATIENCE_MS):
+        other_is_shown.set()
+    assert names(study) == ["recording"]
+    end.set()
+    qtbot.waitUntil(lambda: is_idle(study), timeout=PATIENCE_MS)
+    assert names(study) == ["recording"]
+    assert study.message.text().startswith("study: ")
+
+
+def test_numbers_of_the_means_are_right_aligned(study: StudyWindow):
+    columns = ("current_a", "gas", "repeat", "width_mm", "height_mm")
+    rows = (("80", "Ar", "1", "5.003 ± 0.010", "–"), ("–", "CO2", "b", "−5.1", "0.3 ± 0.1"))
+    study.means.show_table(Table("summary", "Means", columns, rows))
+    right = [
+        [bool(study.means.item(row, column).textAlignment() & RIGHT) for column in range(5)]
+        for row in range(2)
+    ]
+    assert right == [[True, False, False, True, True]] * 2

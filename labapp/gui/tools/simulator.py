@@ -45,6 +45,7 @@ class SimulatorWindow(ToolWindow):
         """The last written scenario, and its folder."""
         self._own: Path | None = None
         self._proposed = ""
+        self._seed: int | None = None
         self._turn = threading.Lock()
         super().__init__(sessions, window)
         self._sessions = sessions
@@ -108,11 +109,11 @@ class SimulatorWindow(ToolWindow):
     # --- what is to be simulated ---------------------------------------------------------------
 
     def prefill(self) -> None:
-        """Propose a folder the first time; draw the chosen scenario unless it is drawn already."""
+        """Propose a folder the first time; draw what was to be drawn, unless it is already."""
         if not self._proposed:
             self._propose(self._preferences.current.folder)
         if self.preview is None and not self.previews.active:
-            self.show_scenario()
+            self._draw(self._seed)
 
     def show_scenario(self) -> None:
         """Draw the chosen scenario, and show its seed and number of frames."""
@@ -147,7 +148,14 @@ class SimulatorWindow(ToolWindow):
     # --- its first frame -----------------------------------------------------------------------
 
     def _draw(self, seed: int | None) -> None:
-        """Draw the first frame in the background; only the last request is shown."""
+        """Draw the first frame in the background; only the last request is shown.
+
+        Parameters
+        ----------
+        seed
+            None: the scenario's, which is then shown with its number of frames.
+        """
+        self._seed = seed
         path = self.scenario.value()
         for task in self.previews.active:
             task.cancel()

@@ -15,6 +15,7 @@ from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QHeaderView, QTabWid
 from labapp.gui.dialogs import SETUP_FILES, ask_file, ask_folder, ask_save, dropped_paths
 from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import study_presenter as presenter
+from labapp.gui.tools.study_sessions import BegunSession, begin_session, must_be_closed
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.widgets.fields import (
     ChoiceField,
@@ -239,6 +240,9 @@ class StudyWindow(ToolWindow):
         study = self._try(lambda: Study(path))
         if study is not None:
             self.study, self.found, self.summary = study, [], None
+            for table in (self.list, self.outliers):
+                table.clearSelection()
+            self._draw()
             self.say(f"{path}")
             self._look()
 
@@ -311,10 +315,11 @@ class StudyWindow(ToolWindow):
 
     def _draw(self) -> None:
         summary, condition = self.summary, self.against.value()
-        if summary is not None and summary.groups:
-            self.sheet.show_png(
-                condition_picture(summary, condition), f"Sizes against {column_heading(condition)}"
-            )
+        if summary is None or not summary.groups:
+            self.sheet.show_words("No frame has a surface" * (summary is not None))
+            return
+        words = f"Sizes against {column_heading(condition)}"
+        self.sheet.show_png(condition_picture(summary, condition), words)
 
     def show_page(self) -> None:
         """Show the summary in the browser."""
@@ -357,20 +362,29 @@ class StudyWindow(ToolWindow):
                 workers, scheduler, surfaces=surfaces, progress=progress, note=control.part
             )
 
-        def done(found: list[RecordingStatus]) -> None:
-            self.say(count_states(found))
+        def is_shown() -> bool:
+            shown = self.study
+            return shown is not None and (shown.path, shown.plan) == (study.path, study.plan)
 
-        self.begin(f"Measuring {study.plan.title}", work, done, self._show_part)
+        def part(found: list[RecordingStatus] | str) -> None:
+            if isinstance(found, str) or is_shown():
+                self._show_part(found)
+
+        def done(found: list[RecordingStatus]) -> None:
+            self.say(f"{study.plan.title}: " * (not is_shown()) + count_states(found))
+
+        self.begin(f"Measuring {study.plan.title}", work, done, part)
 
     # --- one recording -------------------------------------------------------------------------
 
     def selected(self) -> tuple[StudyRecording, int | None] | None:
         """Recording and frame selected in the visible table; None without a selection."""
-        table = self.outliers if self.tabs.currentWidget() is self.outliers else self.list
-        row = table.currentRow()
-        if not table.isVisible() or not table.selectedItems() or table.table is None:
+        table = next(
+            (t for t in (self.list, self.outliers) if t is self.tabs.currentWidget()), None
+        )
+        if table is None or table.table is None or not table.selectedItems():
             return None
-        cells = table.table.rows[row]
+        cells = table.table.rows[table.currentRow()]
         name, frame = str(cells[0]), str(cells[1]) if table is self.outliers else ""
         for one in self.found:
             if one.recording.name == name and one.frames:
@@ -383,19 +397,23 @@ class StudyWindow(ToolWindow):
         if chosen is None or study is None or self.working:
             return
         recording, frame = chosen
+        present = self.workspace.session
+        if present is not None and must_be_closed(study, recording, present.path):
+            self._sessions.close()  # it would be in use, and another made beside it
 
-        def work(control: Control) -> Path:
-            return presenter.begin_session(study.folder, recording, progress_of(control))
+        def work(control: Control) -> BegunSession:
+            return begin_session(study, recording, progress_of(control))
 
-        def opened(path: Path) -> None:
-            if self._sessions.open(path):
+        def opened(begun: BegunSession) -> None:
+            if self._sessions.open(begun.path):
                 if frame is not None:
                     self.workspace.show_frame(frame)
                 self.workspace.action_requested.emit("step_surface")
                 # It would cover the main window, above which its desktop keeps it.
                 self.close()
-                self.say(f"{recording.name} is open in the main window")
-                words = f"{recording.name} is open; Tools, {self.title} shows the study again"
+                name, kept = begun.path.stem, f"; {begun.kept}" * bool(begun.kept)
+                self.say(f"{name} is open in the main window{kept}")
+                words = f"{name} is open{kept}; Tools, {self.title} shows the study again"
                 self.workspace.notified.emit(words, False)
 
         self.begin(f"Opening {recording.name}", work, opened)

@@ -1,22 +1,17 @@
-"""Data of the window of studies, and sessions of single recordings. Without Qt."""
+"""Data of the window of studies. Without Qt."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 
 from labapp.config.setup import read_setup
 from labapp.core.surface.measures import SIZES
 from labapp.errors import InputError
 from labapp.gui.digits import with_sigma
-from labapp.run.study.plan import StudyPlan, StudyRecording, matching_recordings, shown_condition
+from labapp.run.study.plan import StudyPlan, matching_recordings, shown_condition
 from labapp.run.study.status import STATE_WORDS, RecordingStatus, State
 from labapp.run.study.summary import StudySummary
-from labapp.session.creation import new_session
-from labapp.session.file.database import SUFFIX
-from labapp.session.record import Record
-from labapp.simulation.parallel import Progress
 from labapp.studies.tables import Table
 from labapp.text import axis_label, column_heading, pluralize
 
@@ -97,57 +92,3 @@ def is_setup(path: Path) -> bool:
     except InputError:
         return False
     return True
-
-
-def session_path(folder: Path, recording: StudyRecording) -> Path:
-    """Path of the session of a study's recording, in the folder of the results."""
-    return folder / "sessions" / f"{recording.name}{SUFFIX}"
-
-
-def begin_session(folder: Path, recording: StudyRecording, progress: Progress) -> Path:
-    """Create a session of a study's recording, measured as in the study, unless it exists.
-
-    Parameters
-    ----------
-    folder
-        Folder of the study's results.
-    progress
-        Called with the current stage, the frames done, and their total; may raise to stop. If it
-        raises during the import, no session is left; later, the measured frames are kept.
-
-    Raises
-    ------
-    InputError
-        If the recording or its setup file cannot be read, or the session cannot be written.
-    """
-    path = session_path(folder, recording)
-    if path.exists():
-        return path
-    text = read_setup(recording.setup, lines=True).text
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with new_session(path, _record(recording)) as session:
-        session.set_setup(text)
-        session.set_settings(recording.settings)
-        session.import_recording(
-            recording.path,
-            recording.frames,
-            progress=lambda done, total: progress("importing", done, total),
-        )
-    with session:
-        total = len(session.frames)
-        for done, _ in enumerate(session.measure_each(warm=recording.warm), 1):
-            progress("measuring", done, total)
-    return path
-
-
-def _record(recording: StudyRecording) -> Record:
-    """Record of a recording: conditions with a field of their own, others as notes."""
-    kinds = {each.name: str(each.type) for each in fields(Record)}
-    known, others = {}, []
-    for name, value in recording.conditions.items():
-        wanted = "str" if isinstance(value, str) else "float | None"
-        if kinds.get(name) == wanted and name not in ("title", "notes"):
-            known[name] = value
-        else:
-            others.append(f"{name} = {shown_condition(value)}")
-    return Record(title=recording.name, notes="\n".join(others), **known)  # type: ignore[arg-type]

@@ -46,6 +46,12 @@ class Sheet(FollowsTheme, QScrollArea):
         self.describe(words)
         self.take_colours()
 
+    def show_words(self, words: str) -> None:
+        """Show words instead of a picture."""
+        self._printed = QImage()
+        self._paper.setText(words)
+        self.describe(words)
+
     def copy_picture(self) -> None:
         """Copy the picture to the clipboard as printed."""
         if not self._printed.isNull():

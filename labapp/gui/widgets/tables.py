@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ from PySide6.QtWidgets import (
     QTableWidgetItem,
 )
 
-from labapp.gui.digits import cell_text
+from labapp.gui.digits import NOTHING, cell_text
 from labapp.gui.widgets.buttons import add_menu
 from labapp.gui.widgets.labels import plain_tip
 from labapp.text import column_heading
@@ -28,6 +29,9 @@ HEADER_MARGIN_PX = 8
 """Total margin above and below the two lines of a header."""
 
 RIGHT = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
+
+NUMBER = re.compile(r"[-−]?\d+(\.\d+)?(e[-+]?\d+)?( ± .+)?", re.IGNORECASE)
+"""A number as text, with or without its ±."""
 
 
 class ReadTable(QTableWidget):
@@ -132,15 +136,17 @@ class CellTable(ReadTable):
 
     def show_table(self, table: Table) -> None:
         """Show a table."""
-        self.table = table
         self.setAccessibleDescription(f"{table.caption}. Arrow keys move; Ctrl+C copies it")
         self.setColumnCount(len(table.columns))
         self.setRowCount(len(table.rows))
+        self.table = table  # afterwards: fewer rows end a selection, which may be read
         self.setHorizontalHeaderLabels([column_heading(column) for column in table.columns])
         self.clearContents()  # a column of another table may have been right-aligned
+        numbers = [_are_numbers(cells) for cells in zip(*table.rows, strict=True)]
         for row, cells in enumerate(table.rows):
             for column, cell in enumerate(cells):
-                self.set_cell(row, column, cell_text(cell), number=not isinstance(cell, str))
+                number = numbers[column] or not isinstance(cell, str)
+                self.set_cell(row, column, cell_text(cell), number=number)
         self.resizeRowsToContents()
 
     def copy_csv(self) -> None:
@@ -169,6 +175,12 @@ class FittingTable(CellTable):
     def set_cell(self, row: int, column: int, text: str, *, number: bool, tip: str = "") -> None:
         """Show a text in a cell; a line does not end directly after ±."""
         super().set_cell(row, column, text.replace("± ", "±\N{NO-BREAK SPACE}"), number=number)
+
+
+def _are_numbers(cells: Sequence[str | float | None]) -> bool:
+    """Whether the cells of a column are numbers or empty; some may be formatted already."""
+    texts = [cell for cell in cells if isinstance(cell, str) and cell not in ("", NOTHING)]
+    return bool(texts) and all(NUMBER.fullmatch(text) for text in texts)
 
 
 def table_text(table: QTableView) -> str:
