@@ -134,6 +134,10 @@ def test_budget_of_a_setup_file(
         (("budget", "--height", "0"), "the expected pool: height: 0.0; expected 0.01 to 30 mm"),
         (("budget", "--height", "nan"), "the expected pool: height: nan; expected 0.01 to 30 mm"),
         (("budget", "--height", "4"), "expected a possible pool"),
+        (
+            ("budget", "--width", "1", "--length", "1", "--height", "0.05"),
+            "the expected pool: size: 1 × 1 mm; expected a pool that can be measured",
+        ),
         (("budget", "--width", "-3"), "the expected pool: width: -3.0; expected 1 to 30 mm"),
         (("budget", "--setup", "{}/none.toml"), "none.toml"),
         (("positioning", "--out", "{}", "--format", "gif"), "--format"),

@@ -190,7 +190,13 @@ def analyze_budget(
     from labapp.studies.pictures import bars_picture
     from labapp.studies.predicted_budget import budget_table, predicted_budget
 
-    table = budget_table(predicted_budget(_rig(setup), pool, progress))
+    budget = predicted_budget(_rig(setup), pool, progress)
+    if np.isnan(budget.random).all():
+        count, foot = len(budget.random), pool.footprint
+        size = f"{foot.width_mm:g} × {foot.head_mm + foot.tail_mm:g} mm"
+        right = f"a pool that can be measured: none of {count} simulated ones gave a surface"
+        raise InputError("the expected pool", "size", size, right)
+    table = budget_table(budget)
     names, *columns = zip(*table.rows, strict=True)
     predicted, simulated = (np.array(column, float) for column in columns)  # None becomes NaN
     values = {"predicted": predicted, "simulated": simulated}

@@ -109,7 +109,8 @@ class AnalysisWindow(ToolWindow):
         line.add(self.which)
         self.words = wrapping_label(
             "Tick what is to be computed, then press Run. All of it is simulated; the "
-            "calibration is assumed to be known to 0.1 mm, 0.1° and 0.1 px, a dot to 0.3 px."
+            "calibration is assumed to be known to 0.1 mm, 0.1° and 0.1 px, a dot to 0.3 px; the "
+            "error budget uses the ± of its set-up."
         )
         self.words.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.table = CellTable("Table of the error analysis")

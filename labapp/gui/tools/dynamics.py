@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QCloseEvent
-from PySide6.QtWidgets import QAbstractItemView, QTabWidget, QWidget
+from PySide6.QtWidgets import QAbstractItemView, QSizePolicy, QTabWidget, QWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import dynamics_presenter as presenter
@@ -30,6 +30,18 @@ FILM_MS = 80
 """Interval of the pictures in the film of a mode."""
 
 CHANGED = "Results or signals have changed since: press Analyse again."
+
+
+class _NumberTable(CellTable):
+    """A table whose values with ± are right-aligned; ``words``: the columns without numbers."""
+
+    def __init__(self, name: str, *words: int) -> None:
+        super().__init__(name)
+        self._words = words
+
+    def set_cell(self, row: int, column: int, text: str, *, number: bool, tip: str = "") -> None:
+        """Show a text in a cell."""
+        super().set_cell(row, column, text, number=column not in self._words, tip=tip)
 
 
 class DynamicsWindow(ToolWindow):
@@ -79,8 +91,8 @@ class DynamicsWindow(ToolWindow):
         self.spectrum, self.series = Sheet("Spectrogram and spectrum"), Sheet("Series and events")
         self.event_words = wrapping_label("No change exceeds the noise.")
         self.shape = Sheet("Shape and course of the mode")
-        self.modes, self.events = CellTable("Modes"), CellTable("Events")
-        self.responses = CellTable("Responses")
+        self.modes, self.events = _NumberTable("Modes", 0), _NumberTable("Events", 1)
+        self.responses = _NumberTable("Responses", 0, 1, 2)
         self.play_button = button(
             "Play", "Show one period of this mode as a film; press again to stop", self.play
         )
@@ -109,6 +121,9 @@ class DynamicsWindow(ToolWindow):
             self.tabs.addTab(page, words)
         for label in (self.peak_words, self.event_words, self.response_words):
             label.setAlignment(Qt.AlignmentFlag.AlignTop)
+        # The sheets scroll: the tabs do not need the height that they would like to have.
+        self.tabs.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Ignored)
+        self.tabs.setMinimumHeight(self.tabs.minimumSizeHint().height())
         self.tabs.currentChanged.connect(lambda _: self._turn.stop())
         self.results.addWidget(self.words)
         self.results.addWidget(self.tabs, 1)

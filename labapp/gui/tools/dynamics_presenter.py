@@ -150,7 +150,7 @@ def modes_table(found: Dynamics) -> Table:
             for name, scale in zip(names, scales, strict=True)
         ]
         rows.append((one.name, f"{one.share:.0%}", *cells))
-    columns = ("Mode", "Share", "Hz", "Amplitude (µm)", "Phase (°)", "Damping (1/s)")
+    columns = ("Mode", "Share", "Frequency (Hz)", "Amplitude (µm)", "Phase (°)", "Damping (1/s)")
     return Table("modes", "Modes and their strongest oscillation, with ±", columns, tuple(rows))
 
 
