@@ -148,6 +148,10 @@ def test_budget_of_a_pool_without_enough_dots_is_refused(
         (("budget", "--height", "nan"), "the expected pool: height: nan; expected 0.01 to 30 mm"),
         (("budget", "--height", "4"), "expected a possible pool"),
         (("budget", "--setup", LINES_SETUP), "pattern"),
+        (
+            ("budget", "--width", "1", "--length", "1", "--height", "0.05"),
+            "the expected pool: size: 1 × 1 × 0.05 mm; expected a larger pool",
+        ),
         (("budget", "--width", "-3"), "the expected pool: width: -3.0; expected 1 to 30 mm"),
         (("budget", "--setup", "{}/none.toml"), "none.toml"),
         (("positioning", "--out", "{}", "--format", "gif"), "--format"),

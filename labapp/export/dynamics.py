@@ -253,7 +253,7 @@ def draw_mode(plot: Any, found: Dynamics, one: ModeCourse, turn: float = 0.0) ->
     closed = _closed(found.surfaces.nodes_mm), _closed(shape[:, None])
     (x, y), z = np.moveaxis(closed[0], -1, 0), closed[1][..., 0]
     plot.contourf(x, y, z, np.linspace(-1.05, 1.05, 22), cmap="RdBu_r")
-    plot.set(aspect="equal", xlabel="X (mm)")
+    plot.set(aspect="equal", xlabel="X (mm)", ylabel="Y (mm)")
     figures = one.figures
     text = "no significant oscillation"
     if figures:

@@ -38,6 +38,11 @@ CALIBRATE = "calibrate the picture (step 3)"
             "Correct distance of the laser: -3 is not a number above 0 and below 10000 (mm); "
             f"enter {TYPED}; {CALIBRATE}",
         ),
+        (
+            LASER + PATTERN + "rowz = 19\n",
+            "Correct rowz of the pattern: unknown key; expected rows, the most similar key; "
+            f"enter {TYPED}; {CALIBRATE}",
+        ),
     ],
 )
 def test_missing_setup_values_are_listed_as_instructions(text: str, words: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +12,14 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
+from labapp.core.rows.correction import Correction, delete_dots
 from labapp.errors import InputError
 from labapp.gui.pages.trends.page import TrendsPage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import dynamics_presenter
-from labapp.gui.tools.dynamics import DynamicsWindow
+from labapp.gui.tools.dynamics import CHANGED, DynamicsWindow
 from labapp.session.session import Session
+from labapp.session.signals import Signals
 from tests.conftest import Run
 from tests.core.dynamics_truth import analysed_step
 from tests.gui.conftest import CopySample
@@ -96,6 +100,75 @@ def test_events_are_marked_in_the_trends_and_select_their_frame(
     window.workspace.show(None)
     assert tool.drawn is None
     assert not tool.tabs.isVisible()
+
+
+def with_current(session: Session, ampere: float = 100.0) -> Signals:
+    """Signals with a step of the current in the middle of a session's recording."""
+    last_s = float(session.overview().time_s[-1])
+    time_s = np.linspace(0, last_s, 200)
+    current = np.where(time_s < last_s / 2, ampere, 2 * ampere)
+    return Signals("weld.csv", time_s, current, np.full(200, np.nan))
+
+
+@pytest.mark.slow
+def test_stopped_analysis_of_changed_results_keeps_the_warning(
+    tool: DynamicsWindow, window: MainWindow, qtbot: QtBot
+) -> None:
+    session = window.workspace.session
+    assert session is not None
+    before, result = tool.drawn, session.result(3)
+    assert result is not None
+    found = result.measurement
+    corrected = delete_dots(Correction.of(found.dots, found.lattice), [0])
+    assert window.workspace.attempt(lambda of: of.correct({3: corrected}))
+    assert tool.words.text().startswith(CHANGED)
+    tool.start()
+    tool.reject()
+    qtbot.waitUntil(lambda: not tool.working)
+    assert tool.drawn is before
+    assert tool.words.text().startswith(CHANGED)
+    tool.close()
+    tool.open_beside()
+    assert tool.working
+    qtbot.waitUntil(lambda: not tool.working)
+    assert tool.drawn is not before
+    assert not tool.words.text().startswith(CHANGED)
+
+
+@pytest.mark.slow
+def test_window_closed_during_the_first_analysis_analyses_when_it_is_opened_again(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot
+) -> None:
+    tool = opened(window, copy_sample("gtaw"))
+    assert tool.working
+    tool.close()
+    assert tool.drawn is None
+    tool.open_beside()
+    qtbot.waitUntil(lambda: not tool.working)
+    assert tool.drawn is not None
+
+
+@pytest.mark.slow
+def test_changed_signals_are_analysed(
+    tool: DynamicsWindow, window: MainWindow, qtbot: QtBot
+) -> None:
+    session, attempt = window.workspace.session, window.workspace.attempt
+    assert session is not None
+    assert "no current" in tool.response_words.text()
+    signals = with_current(session)
+    assert attempt(lambda of: of.set_signals(signals))
+    assert tool.words.text().startswith(CHANGED)
+    tool.close()
+    tool.open_beside()
+    qtbot.waitUntil(lambda: not tool.working)
+    assert tool.drawn is not None
+    assert tool.drawn.found.events["current"]
+    assert "no current" not in tool.response_words.text()
+    for changed in (None, with_current(session, 120.0), replace(signals, start_s=0.1)):
+        assert attempt(partial(Session.set_signals, signals=changed))
+        assert tool.words.text().startswith(CHANGED)
+    assert attempt(lambda of: of.set_signals(with_current(session)))
+    assert not tool.words.text().startswith(CHANGED)
 
 
 @pytest.mark.slow

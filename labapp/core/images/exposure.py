@@ -45,6 +45,8 @@ ADVICE: dict[ExposureVerdict, str] = {
     "good": "The dots stand out well.",
 }
 
+GOOD_BUT_DARK = "The dots stand out well, though they are far below full scale."
+
 
 @dataclass(frozen=True)
 class Exposure:
@@ -78,6 +80,8 @@ class Exposure:
     @property
     def advice(self) -> str:
         """Advice to the operator, in a sentence."""
+        if self.verdict == "good" and self.level < DARK:
+            return GOOD_BUT_DARK
         return ADVICE[self.verdict]
 
 

@@ -64,6 +64,7 @@ class LiveStreams(QWidget):
             )
             field.editor.setAccessibleName(f"Port of {words}")
             field.set_value(port)
+            field.editor.setMinimumWidth(1)  # a wider one would be cut off
             field.setFixedWidth(PORT_PX)
             field.edited.connect(partial(self._bring_about, kind))
             for column, widget in enumerate((box, field.label, field)):

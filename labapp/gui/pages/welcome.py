@@ -88,7 +88,7 @@ class Welcome(FollowsTheme, QWidget):
         vbox(*self.samples.values(), 1, of=samples).setSpacing(0)
         self.label.setBuddy(self.list)
         self.nothing = wrapping_label(
-            "No session was opened yet. Open a recording, or drop a video, an image, a folder of "
+            "No recent sessions. Open a recording, or drop a video, an image, a folder of "
             "images or a session anywhere on this window; or try a sample."
         )
         recent = vbox(self.label, (self.list, 1), self.nothing, 0)

@@ -77,6 +77,9 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
             calibrate = ["calibrate the picture (step 3)"]
         elif part not in PARTS:
             wrong.append(f"take out {problem.field}: {problem.expected}")
+        elif problem.value == "unknown key":
+            of = f"{key} of {PARTS[part]}"
+            wrong.append(f"correct {of}: unknown key; expected {problem.expected}")
         elif problem.value == "missing":
             missing.setdefault(PARTS[part], []).extend([split_unit(key)[0]] if key else [])
         else:
@@ -101,10 +104,10 @@ def read_only(session: Session | None) -> str:
     return READ_ONLY if session is not None and session.read_only else ""
 
 
-def recording_gone(session: Session) -> str:
-    """Message if the recording is missing, and what to do; empty if it is not."""
+def recording_gone(session: Session, where: str = " (step Recording)") -> str:
+    """Message if the recording is missing, and what to do ``where``; empty if it is not."""
     missing = session.missing_recording
-    return "" if missing is None else f"{missing.name} is missing: locate it (step Recording)"
+    return "" if missing is None else f"{missing.name} is missing: locate it{where}"
 
 
 def why_not_measurable(session: Session) -> str:

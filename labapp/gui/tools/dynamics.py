@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QCloseEvent
-from PySide6.QtWidgets import QAbstractItemView, QTabWidget, QWidget
+from PySide6.QtWidgets import QAbstractItemView, QSizePolicy, QTabWidget, QWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import dynamics_presenter as presenter
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 FILM_MS = 80
 """Interval of the pictures in the film of a mode."""
 
-CHANGED = "Results have changed since: press Analyse again."
+CHANGED = "Results or signals have changed since: press Analyse again."
 
 
 class DynamicsWindow(ToolWindow):
@@ -41,7 +41,7 @@ class DynamicsWindow(ToolWindow):
     def __init__(self, sessions: Files, window: QWidget) -> None:
         self.drawn: presenter.DrawnDynamics | None = None
         """The displayed analysis; None before the first one."""
-        self._of: Overview | None = None
+        self._of: presenter.Analysed | None = None
         self._event_frames: tuple[int, ...] = ()
         self._film: list[bytes] = []
         super().__init__(sessions, window)
@@ -109,6 +109,9 @@ class DynamicsWindow(ToolWindow):
             self.tabs.addTab(page, words)
         for label in (self.peak_words, self.event_words, self.response_words):
             label.setAlignment(Qt.AlignmentFlag.AlignTop)
+        # The sheets scroll: the tabs do not need the height that they would like to have.
+        self.tabs.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Ignored)
+        self.tabs.setMinimumHeight(self.tabs.minimumSizeHint().height())
         self.tabs.currentChanged.connect(lambda _: self._turn.stop())
         self.results.addWidget(self.words)
         self.results.addWidget(self.tabs, 1)
@@ -125,19 +128,26 @@ class DynamicsWindow(ToolWindow):
 
     def prefill(self) -> None:
         """Analyse the session's results unless they are already shown."""
-        if not presenter.same_results(self._overview(), self._of):
+        if not presenter.same_results(self._present(), self._of):
             self.start()
 
     def _overview(self) -> Overview | None:
         """Overview of the session; None without a session, and if it is damaged: reported."""
         return self.workspace.run_or_report(self.workspace.overview)
 
+    def _present(self) -> presenter.Analysed | None:
+        """What would be analysed now; None without a session, and if it is damaged: reported."""
+        session, seen = self.workspace.session, self._overview()
+        if session is None or seen is None:
+            return None
+        return self.workspace.run_or_report(lambda: presenter.Analysed(seen, session.signals))
+
     def start(self) -> None:
         """Analyse the session's results in the background."""
         flush_fields(self.form)
-        session, seen = self.workspace.session, self._overview()
-        why = presenter.impossible(session, seen)
-        if why or session is None or seen is None or self.working:
+        session, present = self.workspace.session, self._present()
+        why = presenter.impossible(session, None if present is None else present.seen)
+        if why or session is None or present is None or self.working:
             self.show_state()
             return
         ends = [value for field in self.band if (value := field.value()) is not None]
@@ -148,15 +158,15 @@ class DynamicsWindow(ToolWindow):
 
         band = (ends[0], ends[1]) if ends else None
         settings = DynamicsSettings(self.of.value(), band, self.segment.value())
-        signals = session.signals.timed() if session.signals else {}
+        signals, count = present.timed_signals, len(present.seen.frame)
 
         def counted(control: Control) -> Iterator[MeasuredSurface]:
             from labapp.export.dynamics import measured_of
 
             for done, one in enumerate(measured_of(session.frame_results(stale=False))):
-                control.progress(done, len(seen.frame), "reading surfaces")
+                control.progress(done, count, "reading surfaces")
                 yield one
-            control.progress(len(seen.frame), len(seen.frame), "analysing")
+            control.progress(count, count, "analysing")
 
         def work(control: Control) -> presenter.DrawnDynamics:
             from labapp.export.dynamics import dynamics_of
@@ -164,8 +174,11 @@ class DynamicsWindow(ToolWindow):
             found = dynamics_of(counted(control), signals, settings)
             return presenter.draw(found, control.check)
 
-        self._of = seen
-        self.begin("Analysing", work, self.show_found)
+        def done(drawn: presenter.DrawnDynamics) -> None:
+            self._of = present
+            self.show_found(drawn)
+
+        self.begin("Analysing", work, done)
 
     def show_found(self, drawn: presenter.DrawnDynamics) -> None:
         """Show an analysis."""
@@ -280,11 +293,11 @@ class DynamicsWindow(ToolWindow):
 
     def show_state(self) -> None:
         """Enable the actions that are available now, and show what can be determined."""
-        session = self.workspace.session
-        seen = self._overview()
-        why = presenter.impossible(session, seen)
+        present = self._present()
+        seen = None if present is None else present.seen
+        why = presenter.impossible(self.workspace.session, seen)
         text = why or (presenter.range_text(seen) if seen is not None else "")
-        if self.drawn is not None and not presenter.same_results(seen, self._of):
+        if self.drawn is not None and not presenter.same_results(present, self._of):
             text = f"{CHANGED} {text}"
         self.words.setText(text)
         idle = not self.working

@@ -20,8 +20,10 @@ from labapp.text import pluralize
 if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics
     from labapp.core.dynamics.modes import ModeCourse
+    from labapp.core.values import FloatArray
     from labapp.session.results.measured import Overview
     from labapp.session.session import Session
+    from labapp.session.signals import Signals
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,19 @@ class DrawnDynamics:
     spectrum: bytes
     series: bytes
     modes: tuple[bytes, ...]
+
+
+@dataclass(frozen=True)
+class Analysed:
+    """What of a session is analysed."""
+
+    seen: Overview
+    signals: Signals | None
+
+    @property
+    def timed_signals(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Name of a signal → its times in the recording, s, and its values."""
+        return {} if self.signals is None else self.signals.timed()
 
 
 SERIES = [(name, BY_KEY[name].label) for name in WITH_SIGMA]
@@ -78,12 +93,20 @@ def impossible(session: Session | None, seen: Overview | None) -> str:
     return ""
 
 
-def same_results(one: Overview | None, other: Overview | None) -> bool:
-    """Whether two overviews have the same times, measures and stale frames."""
+def same_results(one: Analysed | None, other: Analysed | None) -> bool:
+    """Whether two analyses have the same times, measures, stale frames and signals."""
     if one is None or other is None:
         return one is other
-    pairs = [(one.time_s, other.time_s), (one.stale, other.stale)]
-    pairs += [(values, other.measures[name]) for name, values in one.measures.items()]
+    seen, then = one.seen, other.seen
+    pairs = [(seen.time_s, then.time_s), (seen.stale, then.stale)]
+    pairs += [(values, then.measures[name]) for name, values in seen.measures.items()]
+    if one.signals is not other.signals:
+        signals, before = one.timed_signals, other.timed_signals
+        if list(signals) != list(before):
+            return False
+        pairs += [
+            pair for name in signals for pair in zip(signals[name], before[name], strict=True)
+        ]
     return all(np.array_equal(a.astype(float), b.astype(float), equal_nan=True) for a, b in pairs)
 
 
@@ -127,7 +150,7 @@ def modes_table(found: Dynamics) -> Table:
             for name, scale in zip(names, scales, strict=True)
         ]
         rows.append((one.name, f"{one.share:.0%}", *cells))
-    columns = ("Mode", "Share", "Hz", "Amplitude (µm)", "Phase (°)", "Damping (1/s)")
+    columns = ("Mode", "Share", "Frequency (Hz)", "Amplitude (µm)", "Phase (°)", "Damping (1/s)")
     return Table("modes", "Modes and their strongest oscillation, with ±", columns, tuple(rows))
 
 

@@ -24,6 +24,7 @@ class Sheet(FollowsTheme, QScrollArea):
         self._printed = QImage()
         self._paper = plain_label()
         self._paper.setAlignment(Qt.AlignmentFlag.AlignHCenter | Qt.AlignmentFlag.AlignTop)
+        self._paper.setMinimumWidth(1)  # it is as wide as the view, whatever it showed before
         self.setWidget(self._paper)
         self.setWidgetResizable(True)
         self.setFrameShape(QFrame.Shape.NoFrame)
@@ -67,8 +68,11 @@ class Sheet(FollowsTheme, QScrollArea):
         if self._printed.isNull():
             return
         ratio = self.devicePixelRatioF()
-        wide = min(self.viewport().width(), round(MOST_SCALE * self._printed.width()))
         image = self._printed
+        # Enlarged only as far as all of it can be seen without scrolling.
+        whole = self.viewport().height() * image.width() / image.height()
+        enlarged = min(MOST_SCALE * image.width(), max(whole, image.width()))
+        wide = min(self.viewport().width(), round(enlarged))
         if is_dark(self.palette()):
             image = _as_image(turned(_levels(image), self.palette().base().color().lightness()))
         scaled = image.scaledToWidth(

@@ -144,7 +144,7 @@ def test_missing_recording_is_reported_by_frames(copy_sample) -> None:
         assert missing_text(session).startswith("recording.avi is missing")
         frame_view = look(session, 0)
         assert frame_view.image is None
-        assert frame_view.words == "recording.avi is missing: locate it (step Recording)"
+        assert frame_view.words == "recording.avi is missing: locate it"
 
 
 def make_page(workspace: Workspace) -> CapturePage:

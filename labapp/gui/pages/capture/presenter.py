@@ -74,7 +74,7 @@ def look(session: Session, number: int, judged: bool = True) -> ShownFrame:
     try:
         image = session.frame(number).image
     except InputError as error:
-        return ShownFrame(title, None, None, recording_gone(session) or str(error))
+        return ShownFrame(title, None, None, recording_gone(session, where="") or str(error))
     depth = None if recording is None else recording.bit_depth
     settings = judged_by(session) if judged else None
     return ShownFrame(title, image, _judged(image, settings, depth))

@@ -248,7 +248,7 @@ class LaserPage(Page):
         why_not = result.why_not or self.locked
         tip = "Put angle and distance into the set-up; undo restores the former ones"
         allow(self.use_button, tip, why_not)
-        example = f"{result.why_not}. Drawn is an example"
+        example = f"{result.why_not}. The drawing shows an example"
         words = example if result.found is None else DRAWN_WORDS
         self.drawing.show_laser(*presenter.drawn(readings, result.found), words)
         self._show_lengths(readings)

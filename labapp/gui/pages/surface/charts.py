@@ -44,6 +44,7 @@ class DotsChart(Chart):
         self._errors.setData(ends[:, 0], ends[:, 1])
         message = f"○ captured, + computed; lines: errors × {scale:g}"
         self.say(message if dots is not None else without)
+        self.plot.setVisible(dots is not None)
         self.plot.autoRange()
 
     def take_colours(self) -> None:

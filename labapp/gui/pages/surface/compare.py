@@ -155,5 +155,5 @@ class _FiguresTable(ReadTable):
         self.setWordWrap(False)
         # All columns fit, and a scroll bar would take the space of a row.
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        for column in NUMBERS:
-            self.horizontalHeader().setSectionResizeMode(column, QHeaderView.ResizeMode.Stretch)
+        # Numbers with their ± have the width that they need.
+        self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)

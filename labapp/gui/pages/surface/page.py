@@ -78,6 +78,9 @@ SCREEN_DPI = 96.0
 GAP_PX = 6
 """Gap between groups of tools, and between their lines."""
 
+DOTS_TAB = 2
+"""Tab of the reflected dots on a narrow canvas."""
+
 ANSWER_PX = 80
 """Minimum space for the message beside the save buttons."""
 
@@ -203,6 +206,7 @@ class SurfacePage(Page):
             tooltip="How many times as high heights are drawn; the axis shows true heights",
         )
         self.high.edited.connect(lambda value: self._set(exaggeration=value))
+        self.high.editor.setMinimumWidth(NARROW_FIELD)  # a wider one would be cut off
         self.high.setMaximumWidth(NARROW_FIELD)
         self.colour.setMaximumWidth(2 * NARROW_FIELD)
         for field in (self.colour, self.high):
@@ -358,6 +362,7 @@ class SurfacePage(Page):
         lines = result is not None and result.measurement.lines is not None
         edge = "edge of what the lines show" if lines else "boundary"
         without = "Reflected lines are in step Pattern" if lines else "No reflected dots to compare"
+        self.canvas_parts.setTabVisible(DOTS_TAB, not self.session.has_lines)
 
         def show_charts() -> None:
             self.dots.show_dots(dots, without)

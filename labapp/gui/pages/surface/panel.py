@@ -105,6 +105,9 @@ class SurfacePanel:
         settings = session.settings
         self.scheme.set_value(scheme_name(settings))
         self.correspondence.set_value(settings.correspondence)
+        for field in (self.scheme, self.correspondence):  # lines have neither
+            for widget in (field, field.label):
+                widget.setVisible(not session.has_lines)
         dots = surface_state.state == "failed" and not session.has_lines
         remedy = " Its dots can be corrected in step 6." if dots else ""
         self.status.setText(f"{SIGNS[surface_state.state]} {surface_state.words}{remedy}")

@@ -82,13 +82,17 @@ class TrendsPage(Page):
         self.counted.setText(shown.words)
         self.setup_words.setText(shown.setup_words)
         self.table.set_rows(shown.rows)
+        self.table.setVisible(bool(shown.rows))
+        self.table_heading.setVisible(bool(shown.rows))
         self.spectrum.setVisible(bool(shown.spectrum))
         self.spectrum.show_curves(shown.spectrum, shown.spectrum_axis)
         self.spectrum_words.setText(shown.spectrum_words)
         self.signals_words.setText(shown.signals_words)
         self._show_signals(session.signals, session.read_only)
         for key, box in self._boxes.items():
-            box.setEnabled(key in SIGNALS or not session.has_lines)
+            if key not in SIGNALS:
+                box.setVisible(not session.has_lines)
+        self.choice_heading.setVisible(not session.has_lines or session.signals is not None)
         for widget in (self.of, self.without):
             widget.setEnabled(not session.has_lines)
 
@@ -202,9 +206,11 @@ class TrendsPage(Page):
             lambda: self._copied(self.plots.copy_picture, "The picture is on the clipboard"),
         )
         self.copied = Message(1)
+        self.choice_heading = heading("Shown")
+        self.table_heading = heading("Mean ± standard deviation, range")
         fill(
             self.panel_layout,
-            *(heading("Shown"), self._make_choice(), heading("Mean ± standard deviation, range")),
+            *(self.choice_heading, self._make_choice(), self.table_heading),
             *(self.table, self.counted, self.setup_words, self.without, hbox(values, picture)),
             self.copied,
         )

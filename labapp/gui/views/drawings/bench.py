@@ -125,8 +125,9 @@ class BenchView(Sketch):
         is_drawn = self._view is not None
         width, height = SMALL_PX
         is_small = self.width() < width or self.height() < height
-        first, dot, _ = self._said.partition(". ")
-        self.say(first + dot.strip() if is_small and is_drawn else self._said, is_drawn)
+        first, _, rest = self._said.partition(". ")
+        short = f"{first}. …" if rest else self._said
+        self.say(short if is_small and is_drawn else self._said, is_drawn)
         self.words.setToolTip(plain_tip(self._said))
         self.describe(self._said)
         self.near.setVisible(is_drawn and not is_small and self.width() >= NARROW_PX)
@@ -163,8 +164,9 @@ class BenchView(Sketch):
             box.put_at(place, taken[box.plot])
 
     def obstacles(self, plot: pg.PlotWidget) -> list[QRect]:
-        """Rectangles of names and torch on a plot, which no field may cover, in its pixels."""
+        """Rectangles of names, torch and axes, which no field may cover, in pixels."""
         items = [each for each in plot.items() if isinstance(each, pg.TextItem)]
+        items += [plot.getAxis(side) for side in ("left", "bottom")]
         found = [plot.mapFromScene(each.sceneBoundingRect()).boundingRect() for each in items]
         if plot is self.whole and self._view is not None:
             box = plot.getViewBox()

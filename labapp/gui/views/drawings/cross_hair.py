@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QPointF, QRect, Qt
+from PySide6.QtCore import QMargins, QPointF, QRect, Qt
 from PySide6.QtGui import QPalette, QResizeEvent
 
 from labapp.core.calibration.laser_calibration import LaserCalibration
@@ -89,7 +89,7 @@ class CrossHairView(Sketch):
         self._text(f"full fan angle {fan_deg:g}°", arc[0], (1.05, 1.0))
         self.plot.plot(*diode[:, None], pen=None, symbol="s", symbolSize=13, symbolBrush=ink)
         self._text("laser", diode, (0.5, 1.4))
-        words = f"beam {found.distance_mm:.1f} mm at {found.angle_deg:.2f}°"
+        words = f"beam {found.distance_mm:.1f} mm\nat {found.angle_deg:.2f}°"
         for part, message in ((0.4, f"height {found.height_mm:.1f} mm"), (0.2, words)):
             self._text(message, (diode[0], diode[1] * part), (1.05, 0.5))
         self.plot.setRange(xRange=(-l2 - 4, right), yRange=(-1, diode[1] * 1.15))
@@ -107,7 +107,8 @@ class CrossHairView(Sketch):
             view = self.top.getViewBox()
             ends = (view.mapViewToScene(QPointF(*end)) for end in ((-l2, l3), (l1, -l3)))
             upper, lower = (self.top.mapFromScene(end) for end in ends)
-            taken = [QRect(upper, lower).normalized()]
+            ends_px = 4  # of the thick lines and the marks
+            taken = [QRect(upper, lower).normalized() + QMargins(*[ends_px] * 4)]
             places = ((0.9 * l1, -1.5 * l3), (-0.9 * l2, -1.5 * l3), (4.5, 0.7 * l3))
             for box, place in zip(self.boxes, places, strict=True):
                 box.put_at(np.array(place), taken)
