@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from labapp.config.setup import pattern_values
+from labapp.core.geometry.rig import DotPattern
 from labapp.simulation.forward import trace
 from labapp.simulation.pools import spherical_cap
 from labapp.studies.adviser import search
@@ -15,9 +17,11 @@ from labapp.studies.adviser.bench_limits import BenchLimits, LaserPlace, Place
 from labapp.studies.adviser.check import Check, check, check_text
 from labapp.studies.adviser.expected_pools import ExpectedPools
 from labapp.studies.adviser.height_error import Trial, predicted_errors, simulated_errors
+from labapp.studies.adviser.keys import parse_request
 from labapp.studies.adviser.report import advice_table, advice_text, cost_table
 from labapp.studies.adviser.search import Advice, Effort, Sweep, advise, constraint_text
 from labapp.studies.parameter_deviation import NOMINAL
+from tests.core.test_patterns import measured_pattern
 
 EXPECTED = ExpectedPools((6.0, 7.0), (6.5, 8.0), (0.12, 0.2))
 # A roughly calibrated bench: few pools suffice to show the effect of the plane's distance.
@@ -69,6 +73,14 @@ def test_concave_pools_have_negative_peaks() -> None:
     assert all(pool.peak_mm < 0 for pool in concave.sample(4, 0).pools)
     assert len(concave.corners(shifted=True)) == 32
     assert len(concave.corners(shifted=False)) == 8
+
+
+def test_advice_is_sought_for_a_pattern_of_measured_rays() -> None:
+    pattern = measured_pattern(DotPattern(rows=5, columns=5))
+    pools = {"width_mm": 6.0, "length_mm": 7.0, "height_mm": 0.3}
+    _, limits = parse_request({"pools": pools, "pattern": pattern_values(pattern)}, "here")
+    assert len(limits.pattern.measured) == 24
+    assert np.allclose(limits.pattern.tangents, pattern.tangents, equal_nan=True)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from labapp.config.setup import dot_pattern
-from labapp.config.setup_keys import SECTIONS
+from labapp.config.setup_keys import SECTIONS, rules_for
 from labapp.config.toml_keys import (
     Rule,
     are_numbers,
@@ -136,7 +136,8 @@ def parse_request(
             right = "a pattern of dots: square, hexagonal or directions"
             problems.append(InputError(path, "pattern.kind", f'"{LINES}"', right))
         elif name == "pools" or name in values:
-            problems += check_keys(path, name, values.get(name), rules)
+            own = rules_for(name, values.get(name)) if name == "pattern" else rules
+            problems += check_keys(path, name, values.get(name), own)
     if problems:
         raise InputError.gather(problems)
     limits = _limits({name: values.get(name, {}) for name in TABLES})
