@@ -14,7 +14,6 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
 from pytestqt.qtbot import QtBot
 
-from labapp.config.scenario import read_scenario
 from labapp.core.surface.measures import SIZES
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools.study import StudyWindow
@@ -22,9 +21,8 @@ from labapp.run.study.plan import write_study
 from labapp.run.study.status import StudyProgress
 from labapp.run.study.study import Study
 from labapp.run.study.summary import GroupSummary, Mean, RecordingSummary, StudySummary
-from labapp.simulated.benchmark import scenario_text
-from labapp.simulated.simulate import simulate
 from labapp.studies.tables import Table
+from tests.simulated_recordings import simulated_recording
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.slow
@@ -35,10 +33,7 @@ RIGHT = Qt.AlignmentFlag.AlignRight
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("simulated")
-    (folder / "scenario.toml").write_text(scenario_text(3), "utf-8")
-    simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
-    return folder / "made"
+    return simulated_recording(tmp_path_factory.mktemp("simulated"), 3)
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
-from labapp.config.scenario import read_scenario
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tasks import Control
 from labapp.gui.tools import study as study_window
@@ -20,9 +19,8 @@ from labapp.gui.tools.study import StudyWindow
 from labapp.run import measurers
 from labapp.run.study.study import Study
 from labapp.session.session import Session
-from labapp.simulated.benchmark import scenario_text
-from labapp.simulated.simulate import simulate
 from labapp.simulation.parallel import Progress
+from tests.simulated_recordings import simulated_recording
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.slow
@@ -33,10 +31,7 @@ FRAMES = 5
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("simulated")
-    (folder / "scenario.toml").write_text(scenario_text(FRAMES), "utf-8")
-    simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
-    return folder / "made"
+    return simulated_recording(tmp_path_factory.mktemp("simulated"), FRAMES)
 
 
 @pytest.fixture

@@ -20,7 +20,6 @@ import pytest
 from typer.testing import CliRunner
 
 from labapp.cli import app
-from labapp.config.scenario import read_scenario
 from labapp.config.setup import read_setup
 from labapp.core import pipeline
 from labapp.core.pipeline import Measurement, Settings, measure, start_correction
@@ -44,20 +43,17 @@ from labapp.run.measurers import (
 )
 from labapp.session.record import Record
 from labapp.session.session import Session
-from labapp.simulated.benchmark import scenario_text
-from labapp.simulated.simulate import simulate
 from tests.same import assert_same
+from tests.simulated_recordings import simulated_recording
 
 FRAMES = 9
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> RecordingMeasurer:
-    folder = tmp_path_factory.mktemp("sequence")
-    (folder / "scenario.toml").write_text(scenario_text(FRAMES), "utf-8")
-    simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
-    setup = read_setup(folder / "made" / "setup.toml")
-    return RecordingMeasurer(folder / "made" / "recording.avi", None, setup, Settings())
+    folder = simulated_recording(tmp_path_factory.mktemp("sequence"), FRAMES)
+    setup = read_setup(folder / "setup.toml")
+    return RecordingMeasurer(folder / "recording.avi", None, setup, Settings())
 
 
 def test_two_interleaved_sequences_are_independent(

@@ -7,9 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from labapp.config.scenario import read_scenario
-from labapp.simulated.benchmark import scenario_text
-from labapp.simulated.simulate import simulate
+from tests.simulated_recordings import simulated_recording
 
 FRAMES = 9
 
@@ -19,10 +17,7 @@ Write = Callable[..., Path]
 @pytest.fixture(scope="session")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a simulated recording and its set-up."""
-    folder = tmp_path_factory.mktemp("simulated")
-    (folder / "scenario.toml").write_text(scenario_text(FRAMES), "utf-8")
-    simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
-    return folder / "made"
+    return simulated_recording(tmp_path_factory.mktemp("simulated"), FRAMES)
 
 
 @pytest.fixture
