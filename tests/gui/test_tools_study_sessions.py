@@ -180,3 +180,14 @@ def test_changed_recording_is_refused_until_the_study_is_run_again(
     qtbot.waitUntil(lambda: not tool.working, timeout=PATIENCE_MS)
     assert tool.workspace.session is None
     assert "run again" in tool.message.text()
+    qtbot.waitUntil(lambda: not tool.looks.active, timeout=PATIENCE_MS)
+
+
+def test_reading_stopped_by_closing_is_repeated(tool: StudyWindow, file: Path, qtbot: QtBot):
+    tool.show_study(file)
+    tool.close()
+    assert not tool.looks.active
+    assert tool.summary is None
+    tool.open_beside()
+    qtbot.waitUntil(lambda: tool.summary is not None, timeout=PATIENCE_MS)
+    qtbot.waitUntil(lambda: not tool.looks.active, timeout=PATIENCE_MS)

@@ -68,6 +68,7 @@ class StudyWindow(ToolWindow):
         """Progress of each recording."""
         self.summary: StudySummary | None = None
         """Results of the study; None before there are any."""
+        self._look_is_due = False
         super().__init__(sessions, window)
         self._sessions = sessions
         self.looks = Tasks(self)
@@ -271,8 +272,8 @@ class StudyWindow(ToolWindow):
         self.looks.start("Reading the study", work, self._show_summary, self._show_part)
 
     def _look_at_end(self) -> None:
-        """Show the progress when a run has ended in any way."""
-        if not self.working:
+        """Show the progress when a run has ended in any way, unless nobody would see it."""
+        if not self.working and self.isVisible():
             self._look()
 
     def _show_part(self, part: list[RecordingStatus] | str) -> None:
@@ -419,9 +420,16 @@ class StudyWindow(ToolWindow):
         self.begin(f"Opening {recording.name}", work, opened)
 
     def closeEvent(self, event: QCloseEvent) -> None:
-        """Also stop reading."""
-        self.looks.cancel_all()
+        """Also stop reading; it is repeated when the window is shown again."""
+        self._look_is_due = self.working or bool(self.looks.active)
         super().closeEvent(event)
+        self.looks.cancel_all()
+
+    def prefill(self) -> None:
+        """Read the progress again if closing the window stopped a run or the reading."""
+        if self._look_is_due:
+            self._look_is_due = False
+            self._look()
 
     def show_state(self) -> None:
         """Enable the actions that are available now."""
