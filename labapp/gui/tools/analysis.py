@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QCheckBox, QStackedWidget, QWidget
+from PySide6.QtWidgets import QCheckBox, QSizePolicy, QStackedWidget, QWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import analysis_presenter as presenter
@@ -117,6 +117,7 @@ class AnalysisWindow(ToolWindow):
             "parts assume these. A dot is known to 0.3 px."
         )
         self.why = wrapping_label()
+        self.why.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
         self.why.hide()
         self.words.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.table = CellTable("Table of the error analysis")
