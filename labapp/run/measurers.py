@@ -448,8 +448,21 @@ def await_loaded(pools: Sequence[Executor]) -> None:
 
 
 def load_all() -> None:
-    """Import all modules for measuring in this process."""
+    """Import all modules for measuring a video in this process: it takes longer than 100 frames."""
+    import scipy.spatial  # noqa: F401 - otherwise loaded when it is first used
+
+    import labapp.core.images.centroid_kernels
+    import labapp.core.images.size_kernels
+    import labapp.core.matching.initial.quadric_kernels
     import labapp.core.matching.match_kernels
+    import labapp.core.recording.chain
+    import labapp.core.recording.row_vote
     import labapp.core.rows.lattice_kernels
-    import labapp.core.sequence.tracking
-    import labapp.export.fixed_point  # noqa: F401
+    import labapp.core.surface.kernels.boundary_kernels
+    import labapp.core.surface.kernels.rounds_kernels
+    import labapp.core.surface.kernels.setup_kernels
+    import labapp.core.surface.kernels.shape_kernels
+    import labapp.export.fixed_point
+    import labapp.media.formats.video  # noqa: F401
+
+    _threads()

@@ -361,6 +361,36 @@ def test_linear_algebra_uses_one_thread_from_the_first_frame() -> None:
     assert (process.returncode, process.stdout) == (0, "{1}\n"), process.stderr
 
 
+LOADED = """
+    import sys
+    from pathlib import Path
+
+    from labapp.config.setup import read_setup
+    from labapp.core.pipeline import Settings
+    from labapp.run.measurers import RecordingMeasurer, load_all
+
+    load_all()
+    before = set(sys.modules)
+    folder = Path(sys.argv[1])
+    setup = read_setup(folder / "setup.toml")
+    list(RecordingMeasurer(folder / "recording.avi", None, setup, Settings())(range(5)))
+    loaded = set(sys.modules) - before
+    print({name for name in loaded if name.startswith(("labapp.", "scipy.spatial"))})
+"""
+
+
+def test_a_started_process_has_loaded_what_frames_need(recording: RecordingMeasurer) -> None:
+    process = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(LOADED), str(recording.path.parent)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "PYTHONPATH": "."},
+    )
+    assert (process.returncode, process.stdout) == (0, "set()\n"), process.stderr
+
+
 @pytest.fixture
 def slipping(
     monkeypatch: pytest.MonkeyPatch, recording: RecordingMeasurer
