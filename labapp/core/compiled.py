@@ -18,6 +18,7 @@ from pathlib import Path
 from threading import Event, Lock
 from typing import Any, TypeVar
 
+import llvmlite.binding
 import numba
 import platformdirs
 from filelock import FileLock
@@ -127,13 +128,39 @@ class OwnCopies(JITCodeLibrary):
     linker use one copy for the whole process: the first one. This is the function's own copy if it
     was just compiled, but that of the caller loaded first if all were loaded from disk. Copies are
     optimised in different contexts, so that their sums differ in the last digits.
+
+    The cache also has the LLVM code of a function, from which its callers are compiled. numba reads
+    it along with the machine code, which takes as long as all else; here it is read when needed.
     """
+
+    _unread = b""
 
     def _optimize_final_module(self) -> None:
         for function in self._final_module.functions:
             if function.linkage.name == "linkonce_odr":
                 function.linkage = "internal"
         super()._optimize_final_module()  # type: ignore[no-untyped-call]
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: Any) -> Any:
+        name, kind, (machine_code, llvm_code) = state
+        empty = llvmlite.binding.parse_assembly("").as_bitcode()
+        made = super()._unserialize(codegen, (name, kind, (machine_code, empty)))  # type: ignore[no-untyped-call]
+        made._shared_module, made._unread = None, llvm_code
+        return made
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return the address of a function in this code."""
+        if self._unread:  # numba looks for its name in the LLVM code
+            address: int = self._codegen._engine.get_function_address(name)
+            return address
+        return int(super().get_pointer_to_function(name))  # type: ignore[no-untyped-call]
+
+    def _get_module_for_linking(self) -> Any:
+        if self._unread:
+            self._shared_module = llvmlite.binding.parse_bitcode(self._unread)
+            self._unread = b""
+        return super()._get_module_for_linking()  # type: ignore[no-untyped-call]
 
 
 def is_kept(module: str, file: Path) -> bool:

@@ -72,6 +72,40 @@ def test_cached_code_computes_the_same_as_freshly_compiled_code(tmp_path):
     assert outputs[0] == outputs[1]
 
 
+CALLER = """
+import numpy as np
+from loops import _f2, compiled, moments
+
+
+@compiled(_f2)
+def total(values):
+    return moments(values, np.ones_like(values)).sum()
+"""
+
+CALL = """
+import numpy as np
+from loops import moments
+from callers import total
+
+values = np.linspace(0.0, 1.0, 12).reshape(3, 4)
+print(np.isclose(total(values), moments(values, np.ones((3, 4))).sum(), rtol=1e-12))
+"""
+
+
+@pytest.mark.slow
+def test_a_caller_of_cached_code_can_be_compiled(tmp_path):
+    (tmp_path / "loops.py").write_text(LOOPS, "utf-8")
+    (tmp_path / "callers.py").write_text(CALLER, "utf-8")
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": str(tmp_path),
+    }
+    for commands in ("import loops", CALL, CALL):
+        command = [sys.executable, "-c", commands]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout == "True\n"
+
+
 def test_cache_key_depends_on_imported_sources_and_numba_version(tmp_path, monkeypatch):
     package = tmp_path / "package"
     (package / "far").mkdir(parents=True)
