@@ -140,6 +140,8 @@ class VideoSource(FrameSource):
         self._table = table
         self._ordinal = {place: k for k, place in enumerate(table.place.tolist())}
         self._keys = np.flatnonzero(table.key)
+        # Ascending, for a binary search, even if frames are out of order.
+        self._least_from = np.minimum.accumulate(table.number[self._keys][::-1])[::-1]
         self._continue_with(self._listed_packets())
 
     def __len__(self) -> int:
@@ -179,8 +181,8 @@ class VideoSource(FrameSource):
 
     def _find(self, index: int) -> tuple[int, VideoFrame] | None:
         """Return frame ``index`` with its number; None if it cannot be decoded."""
-        before = np.flatnonzero(self._table.number[self._keys] <= index)
-        key = int(self._keys[before[-1]]) if len(before) else 0
+        keys = int(np.searchsorted(self._least_from, index, "right"))
+        key = int(self._keys[keys - 1]) if keys else 0
         far = self._table.seekable and key > self._fed + NEAR_PACKETS
         if index < self._next or far:
             self._seek(key)
