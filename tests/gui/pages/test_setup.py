@@ -295,19 +295,37 @@ def test_dimension_entered_in_the_drawing_updates_it(
     assert box.field.value() == value
 
 
+def assert_nothing_overlaps(page: SetupPage) -> None:
+    """Check the fields of the drawing as drawn: against each other, names, torch and axes."""
+    let_draw()
+    for plot in (page.bench.whole, page.bench.top):
+        boxes = [each for each in page.bench.boxes.values() if each.plot is plot]
+        assert all(plot.rect().contains(each.geometry()) for each in boxes)
+        areas = [*(each.geometry() for each in boxes), *page.bench.obstacles(plot)]
+        pairs = itertools.combinations(areas, 2)
+        obstacles = set(map(id, areas[len(boxes) :]))
+        assert not any(
+            a.intersects(b) for a, b in pairs if not (id(a) in obstacles and id(b) in obstacles)
+        )
+
+
 def test_fields_of_the_drawing_do_not_overlap(page: SetupPage) -> None:
     for size in ((560, 400), (900, 640)):
         page.bench.resize(*size)
+        assert_nothing_overlaps(page)
+
+
+@pytest.mark.parametrize("is_hidden", [False, True])
+def test_fields_do_not_cover_the_names_of_another_session(
+    page: SetupPage, copy_sample: Callable[[str], Path], is_hidden: bool
+) -> None:
+    page.bench.resize(900, 640)
+    for sample in ("gmaw", "five_lines", "concave"):
+        page.setVisible(not is_hidden)
+        page.workspace.show(Session.open(copy_sample(sample)))
         let_draw()
-        for plot in (page.bench.whole, page.bench.top):
-            boxes = [each for each in page.bench.boxes.values() if each.plot is plot]
-            assert all(plot.rect().contains(each.geometry()) for each in boxes)
-            areas = [*(each.geometry() for each in boxes), *page.bench.obstacles(plot)]
-            pairs = itertools.combinations(areas, 2)
-            obstacles = set(map(id, areas[len(boxes) :]))
-            assert not any(
-                a.intersects(b) for a, b in pairs if not (id(a) in obstacles and id(b) in obstacles)
-            )
+        page.show()
+        assert_nothing_overlaps(page)
 
 
 def test_fields_are_below_the_drawing_on_a_small_canvas(qtbot: QtBot, page: SetupPage) -> None:

@@ -165,7 +165,10 @@ class BenchView(Sketch):
 
     def obstacles(self, plot: pg.PlotWidget) -> list[QRect]:
         """Rectangles of names, torch and axes, which no field may cover, in pixels."""
+        plot.getViewBox().updateMatrix()
         items = [each for each in plot.items() if isinstance(each, pg.TextItem)]
+        for name in items:
+            name.updateTransform()  # it would follow the view only when it is painted
         items += [plot.getAxis(side) for side in ("left", "bottom")]
         found = [plot.mapFromScene(each.sceneBoundingRect()).boundingRect() for each in items]
         if plot is self.whole and self._view is not None:
