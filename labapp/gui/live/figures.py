@@ -12,6 +12,7 @@ from PySide6.QtGui import QAccessible, QAccessibleEvent, QPalette
 from PySide6.QtWidgets import QFrame, QGridLayout, QLabel, QWidget
 
 from labapp.gui.digits import NOTHING, plain
+from labapp.gui.shell.steps import setup_to_do
 from labapp.gui.theme import RED, FollowsTheme, is_dark
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import Message, plain_label, selectable_label, set_font
@@ -20,6 +21,7 @@ from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_trend import Pace
+from labapp.session.session import Session
 from labapp.text import marked_setup_words, pluralize, setup_words
 
 DECIMALS = 3
@@ -38,6 +40,7 @@ Look = Literal["plain", "alarm", "old"]
 
 FIRST = "Measuring the first frame: this takes some seconds…"
 NO_SETUP = "Sizes are shown here once the set-up is complete"
+LINES = "Lines are not measured live: record them, and measure the recording"
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,11 @@ def standing_text(stands: Standing, limits: Limits, name: str) -> str:
         "in order": "✓ within limits",
         "in doubt": "◆ at its limit",
     }[stands]
+
+
+def why_unmeasured(session: Session) -> str:
+    """Text of the reason why the frames of a camera are not measured."""
+    return LINES if session.has_lines else f"{NO_SETUP}. {setup_to_do(session.setup_problems)}"
 
 
 def pace_text(

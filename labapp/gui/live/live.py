@@ -19,7 +19,7 @@ import numpy as np
 from labapp.config.setup import Setup
 from labapp.core.images.band_pass import DetectorTuning, quick_dots
 from labapp.core.images.dots import Dots
-from labapp.core.images.find_dots import find_dots
+from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import UNMEASURED, Quality, judge_quality
 from labapp.core.values import CannotMeasure, FloatArray
@@ -102,6 +102,8 @@ class Live:
     ----------
     place
         Function that returns the file for a new recording.
+    settings
+        Settings for frames of dots. None: the frames show lines, whose exposure is not assessed.
     setup
         Rig and image calibration for measuring frames. None: frames are not measured.
     """
@@ -112,7 +114,7 @@ class Live:
         place: Callable[[], Path],
         plan: Plan,
         wanted: CameraSettings,
-        settings: Settings,
+        settings: Settings | None,
         setup: Setup | None = None,
         limits: Limits | None = None,
     ) -> None:
@@ -126,7 +128,7 @@ class Live:
         self._place, self._folder, self._wanted = place, place().parent, wanted
         self._settings, self._limits = settings, limits or Limits()
         self.setup = setup
-        self._dots = settings.dots
+        self._dots = None if settings is None else settings.dots
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._to_show: deque[CameraFrame] = deque(maxlen=1)
         self._to_judge: deque[CameraFrame] = deque(maxlen=1)
@@ -161,7 +163,7 @@ class Live:
             if not self._closing.is_set():
                 self.feed = feed
                 self._recorders = [self._recorder(feed)]
-                if self.setup is not None:
+                if self.setup is not None and self._settings is not None:
                     given = (self.setup, self._settings, feed.bit_depth, self._limits)
                     self.watch = LiveWatch(self.name, *given, self._say)
                 self._begin_work()
@@ -263,34 +265,27 @@ class Live:
 
     def _find_quickly(self, frame: CameraFrame) -> None:
         light, places = self._light, None
-        if light is not None and _fits(light, frame.image):
-            places = _places_px(self._dots_in(frame.image, light))
+        if self._dots is not None and light is not None and _fits(light, frame.image):
+            places = _places_px(_dots_in(frame.image, light, self._dots))
         self._newest.append(LiveFrame(frame, places))
 
-    def _dots_in(self, image: GreyImage, light: DetectorTuning | None) -> Dots | None:
-        """Dots of a frame, found quickly if its light is known; None if there are none."""
-        try:
-            if light is not None:
-                return quick_dots(image, light, self._dots.band_pass)
-            return find_dots(image, self._dots)
-        except CannotMeasure:
-            return None
-
     def _judge(self, frame: CameraFrame) -> None:
-        quick = self._dots.method == "band-pass"
-        now_s, known = time.monotonic(), self._light
-        if quick and (known is None or now_s > self._light_s or not _fits(known, frame.image)):
-            self._light = DetectorTuning.of(frame.image, self._dots.band_pass)
-            self._light_s = now_s + LIGHT_S
-        dots = self._dots_in(frame.image, self._light)
-        found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
-        depth = None if self.feed is None else self.feed.bit_depth
-        quality = judge_quality(frame.image, found, depth, rays_of(self.setup))
         self._frame_byte = frame.image.nbytes
         try:
             self.room_byte = shutil.disk_usage(self._folder).free
         except OSError:
             self.room_byte = None
+        if self._dots is None:
+            return
+        quick = self._dots.method == "band-pass"
+        now_s, known = time.monotonic(), self._light
+        if quick and (known is None or now_s > self._light_s or not _fits(known, frame.image)):
+            self._light = DetectorTuning.of(frame.image, self._dots.band_pass)
+            self._light_s = now_s + LIGHT_S
+        dots = _dots_in(frame.image, self._light, self._dots)
+        found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
+        depth = None if self.feed is None else self.feed.bit_depth
+        quality = judge_quality(frame.image, found, depth, rays_of(self.setup))
         places = None if quick else _places_px(dots)
         self._judged.append(JudgedFrame(places, quality))
 
@@ -438,6 +433,16 @@ def _fits(light: DetectorTuning, image: GreyImage) -> bool:
 
 def _places_px(dots: Dots | None) -> FloatArray:
     return np.zeros((0, 2)) if dots is None else dots.image_px
+
+
+def _dots_in(image: GreyImage, light: DetectorTuning | None, settings: DotSettings) -> Dots | None:
+    """Dots of a frame, found quickly if its light is known; None if there are none."""
+    try:
+        if light is not None:
+            return quick_dots(image, light, settings.band_pass)
+        return find_dots(image, settings)
+    except CannotMeasure:
+        return None
 
 
 def rays_of(setup: Setup | None) -> int | None:

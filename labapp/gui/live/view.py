@@ -15,18 +15,17 @@ from labapp.core.values import FloatArray
 from labapp.gui.live.camera_fields import CameraFields, calibrated_px
 from labapp.gui.live.canvas import LiveCanvas
 from labapp.gui.live.figures import (
-    NO_SETUP,
     OLD_S,
     LiveFigures,
     figures,
     live_setup_words,
     pace_text,
+    why_unmeasured,
 )
 from labapp.gui.live.live import SIMULATED, Live, choices, setup_of
 from labapp.gui.live.penetration import LivePenetration
 from labapp.gui.live.plan_fields import PlanFields
 from labapp.gui.live.record_bar import RecordBar
-from labapp.gui.shell.steps import setup_to_do
 from labapp.gui.tasks import DONE, Control, Task
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
@@ -151,7 +150,7 @@ class LiveView(QObject):
             lambda: recording_path(folder, stem),
             self.plan_fields.plan(),
             CameraSettings(),
-            session.settings,
+            None if session.has_lines else session.settings,
             setup_of(session),
             session.limits,
         )
@@ -199,8 +198,7 @@ class LiveView(QObject):
         self._rings.setData([])
         self.measured_s, self._result = 0.0, None
         self.figures.show_figures(figures(None) if live.watch is not None else ())
-        to_do = "" if session is None else setup_to_do(session.setup_problems)
-        self.figures.words.setText("" if live.watch else f"{NO_SETUP}. {to_do}")
+        self.figures.words.setText("" if live.watch or session is None else why_unmeasured(session))
         self.figures.setup_words.setText("")
         self.canvas.set_live(live.watch is not None)
         self._rings.show()

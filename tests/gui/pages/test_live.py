@@ -22,7 +22,7 @@ from pytestqt.qtbot import QtBot
 from labapp.config.setup import read_setup
 from labapp.core.pipeline import Settings
 from labapp.gui.live import view as live_view
-from labapp.gui.live.figures import Figure, figures
+from labapp.gui.live.figures import LINES, Figure, figures
 from labapp.gui.live.live import SIMULATED, STATES, WAITS, Live, choices
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.shell.window import MainWindow
@@ -388,6 +388,29 @@ def test_large_figures_are_shown_if_the_setup_is_complete(
     qtbot.waitUntil(lambda: "Height" in [each.text() for each in labels])
     qtbot.waitUntil(lambda: any("±" in each.text() for each in labels))
     assert {"Width", "Length", "Height", "mm"} <= {each.text() for each in labels}
+
+
+@pytest.mark.parametrize("sample", ["five_lines", "gmaw"])
+def test_lines_are_not_judged_as_dots(
+    window: MainWindow,
+    page: CapturePage,
+    qtbot: QtBot,
+    monkeypatch: pytest.MonkeyPatch,
+    sample: str,
+):
+    with Session.open(SAMPLES / sample / f"{sample}.labsession", read_only=True) as lines:
+        setup, recording = lines.setup_text, lines.path.with_name(Path(lines.recording.path).name)
+    with open_source(recording) as video:
+        image = video.frame(0).image
+    window.workspace.attempt(lambda session: session.set_setup(setup))
+    camera = SimulatedDevice("pool", lambda _: image, rate_hz=20)
+    monkeypatch.setattr(live_view, "pool_camera", lambda *_: camera)
+    start(page, qtbot)
+    view = page.live_view
+    qtbot.waitUntil(lambda: view.live.room_byte is not None and view.updates > 20)
+    assert page.exposure.isHidden()
+    assert not len(view._rings.data)
+    assert view.figures.words.text() == LINES
 
 
 @pytest.mark.slow
