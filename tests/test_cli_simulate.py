@@ -415,7 +415,7 @@ def test_impossible_output_folder_is_reported(tmp_path: Path, labapp: Run) -> No
     path = scenario(tmp_path)
     code, _, stderr = labapp("simulate", path, "--out", path / "out", "--frames", 1)
     assert code == 2
-    assert f"{path / 'out'}: --out: " in stderr
+    assert f"{path / 'out'}: folder: " in stderr
     assert "expected a folder that can be written" in stderr
 
 

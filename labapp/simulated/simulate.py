@@ -53,7 +53,7 @@ def simulate(
     recording = scenario.recording
     if workers is None:
         workers = min(os.cpu_count() or 1, len(recording.pools))
-    with os_errors_as_input(out, "--out", "a folder that can be written"):
+    with os_errors_as_input(out, "folder", "a folder that can be written"):
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as beside:
             part = Path(beside) / out.name
@@ -70,13 +70,13 @@ def _check_replaceable(out: Path) -> None:
     if not out.exists():
         return
     if not out.is_dir():
-        raise InputError(out, "--out", "is a file", OWN_FOLDER)
+        raise InputError(out, "folder", "is a file", OWN_FOLDER)
     # The lock of a session that no longer exists can be removed.
     names = {path.name for path in out.iterdir() if path.suffix != ".lock"}
     foreign = sorted(names - FILES - set(RECORDINGS.values()))
     if names and (foreign or SCENARIO not in names):
         found = f"holds {foreign[0]}" if foreign else f"holds no {SCENARIO}"
-        raise InputError(out, "--out", found, OWN_FOLDER)
+        raise InputError(out, "folder", found, OWN_FOLDER)
 
 
 def begin_session(

@@ -96,6 +96,7 @@ def test_recording_equals_that_of_the_command_and_is_opened(
     assert session.record.title == "The tail ends below the work piece (§7.2)"
     assert session.record.expected_width_mm == pytest.approx(6.66, rel=0.1)
     assert not simulator.isVisible()
+    assert "is open" in simulator.message.text()
     for _, result in session.measure_each([0]):
         assert result.status == "ok"
 
@@ -133,7 +134,7 @@ def test_invalid_input_is_reported_and_nothing_written(
     (folder / "mine.txt").write_text("mine")
     simulator.folder.editor.setText(str(folder))
     click(simulator.start_button)
-    qtbot.waitUntil(lambda: "holds mine.txt" in simulator.message.text())
+    qtbot.waitUntil(lambda: "folder: holds mine.txt" in simulator.message.text())
     assert [path.name for path in folder.iterdir()] == ["mine.txt"]
     assert not simulator.open_button.isEnabled()
 

@@ -101,6 +101,7 @@ def test_study_is_created_and_run_and_a_recording_opened(
     qtbot.waitUntil(lambda: is_idle(study) and study.summary is not None, timeout=4 * PATIENCE_MS)
     assert states(study) == {"I80_1": "done", "I100_1": "done", "I120_1": "failed"}
     assert [study.means.table.rows[k][0] for k in range(2)] == ["80", "100"]
+    assert study.tabs.tabText(3) == "Outliers: none"
     assert (study.study.folder / "measures.parquet" / "I80_1.parquet").exists()
     row = next(k for k, cells in enumerate(study.list.table.rows) if cells[0] == "I120_1")
     assert study.list.table.rows[row][-1]

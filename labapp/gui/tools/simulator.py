@@ -246,6 +246,7 @@ class SimulatorWindow(ToolWindow):
         if self._sessions.open(path):
             self._propose(path.parent.parent)  # the next recording must not replace the open one
             self.close()
+            self.say(f"{path.stem} is open in the main window")
 
     def closeEvent(self, event: QCloseEvent) -> None:
         """Also stop drawing."""

@@ -310,6 +310,8 @@ class StudyWindow(ToolWindow):
         if self.summary is not None:
             self.means.show_table(presenter.means_table(self.summary))
             self.outliers.show_table(presenter.outliers_table(self.summary))
+            found = len(self.summary.outliers)
+            self.tabs.setTabText(self.tabs.indexOf(self.outliers), f"Outliers: {found or 'none'}")
         for place in range(1, self.tabs.count()):
             self.tabs.setTabEnabled(place, self.summary is not None)
         self.show_state()

@@ -112,7 +112,7 @@ def run_jobs(
 def _error_of(future: Future[None]) -> Exception | None:
     """The exception that a task raised, or None."""
     if future.cancelled():
-        raise InputError("--scheduler", "connection", "lost", f"{A_SCHEDULER}; then run again")
+        raise InputError("Dask", "connection", "lost", f"{A_SCHEDULER}; then run again")
     error = future.exception()
     if error is not None and not isinstance(error, Exception):
         raise error
@@ -212,12 +212,12 @@ def dask_workers(address: str) -> Iterator[Workers]:
         from distributed import Client
     except ImportError as error:
         expected = "dask: pip install 'labapp[study]'"
-        raise InputError("--scheduler", "dask", "is not installed", expected) from error
+        raise InputError("Dask", "package", "is not installed", expected) from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
-        raise InputError("--scheduler", "scheduler", address, A_SCHEDULER) from error
+        raise InputError("Dask", "scheduler", address, A_SCHEDULER) from error
     try:
         threads = client.nthreads()
         several = sum(each > 1 for each in threads.values())
@@ -247,6 +247,6 @@ class _Slots:
             try:
                 self._count = 2 * max(1, sum(self._client.nthreads().values()))
             except (OSError, TimeoutError) as error:
-                raise InputError("--scheduler", "connection", "lost", A_SCHEDULER) from error
+                raise InputError("Dask", "connection", "lost", A_SCHEDULER) from error
             self._at = now
         return self._count
