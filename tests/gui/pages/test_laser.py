@@ -217,6 +217,9 @@ def test_picture_gives_a_reading_and_is_stored(
     page.scale.set_value(25.0)
     points = {point.name: point for point in page.picture_view.points}
     for name, (u, v) in cross_places(12.0).items():
+        # The first places of the points are no reading of this picture.
+        assert not page.add_button.isEnabled()
+        assert name in page.lengths.text()
         points[name].setPos(u, v)
     assert page.lengths.text() == "l₁ 13.68 mm,  l₂ 18.56 mm,  l₃ 7.87 mm"
     page.add_button.click()

@@ -295,8 +295,14 @@ class LaserPage(Page):
         return {name: point.place for name, point in self._points.items()}
 
     def _cross(self) -> tuple[float, float, float] | None:
-        if not self._points:
+        picture = self.picture_view.picture
+        if not self._points or picture is None:
             self.lengths.setText("")
+            return None
+        first = presenter.first_places(picture.shape)
+        left = [name for name, place in self.places().items() if place == first[name]]
+        if left:
+            self.lengths.setText(f"⚠ Still to be dragged: {', '.join(left)}")
             return None
         try:
             lengths = presenter.cross_lengths(self.places(), self.scale.value() or 0.0)
