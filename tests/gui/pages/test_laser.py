@@ -231,6 +231,23 @@ def test_picture_gives_a_reading_and_is_stored(
     np.testing.assert_array_equal(session.picture(calibration.picture_sha256), image)
 
 
+def test_picture_of_another_session_is_removed(
+    qtbot: QtBot, page: LaserPage, tmp_path: Path
+) -> None:
+    cv2.imwrite(str(tmp_path / "cross.png"), np.full((600, 800), 40, np.uint8))
+    page.load_picture(tmp_path / "cross.png")
+    qtbot.waitUntil(lambda: page.picture_view.picture is not None)
+    for point in page.picture_view.points:
+        point.setPos(*cross_places(12.0)[point.name])
+    assert page.add_button.isEnabled()
+    page.workspace.show(Session.create(tmp_path / "other.labsession"))
+    page.refresh()
+    assert page.picture_view.picture is None
+    assert not any(point.isVisible() for point in page.picture_view.points)
+    assert not page.add_button.isEnabled()
+    assert page.lengths.text() == ""
+
+
 def test_unreadable_picture_is_reported(qtbot: QtBot, page: LaserPage, tmp_path) -> None:
     (tmp_path / "bad.png").write_bytes(b"no picture")
     with qtbot.waitSignal(page.workspace.notified) as signal:

@@ -70,6 +70,11 @@ class LaserPage(Page):
         self.in_use.set_rows(presenter.in_use(self.session))
         self._follow()
 
+    def _take_session(self) -> None:
+        """Also remove the picture of the previous session."""
+        super()._take_session()
+        self._show_picture(None)
+
     def readings(self) -> Readings:
         """Readings in the table."""
         cells = {
@@ -273,9 +278,14 @@ class LaserPage(Page):
         if path := ask_file(self, "Picture of the cross hair", self.workspace.folder):
             self.load_picture(path)
 
-    def _show_picture(self, image: GreyImage) -> None:
+    def _show_picture(self, image: GreyImage | None) -> None:
         former = self.picture_view.picture
-        self.picture_view.show_picture(image)
+        self.picture_view.show_picture(image, NO_PICTURE)
+        for point in self._points.values():
+            point.setVisible(image is not None)
+        if image is None:
+            self._dragged()
+            return
         rows, columns = image.shape
         places = presenter.first_places((rows, columns))
         if not self._points:
