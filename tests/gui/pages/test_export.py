@@ -259,6 +259,7 @@ def test_choices_are_locked_for_lines(page: ExportPage, copy_sample) -> None:
         assert box.toolTip().startswith("Lines") is locked
         assert page.view.isEnabled() is not locked
         assert page.spacing.isEnabled() is not locked
+        assert page.scheme.isEnabled() is not locked
         assert page.export_button.isEnabled()
 
 

@@ -105,7 +105,7 @@ class ExportPage(Page):
         # Disabled, not hidden, so that nothing below moves.
         for fields, used in (
             ((self.first, self.last, self.every), part),
-            ((self.spacing,), not made.locked),
+            ((self.scheme, self.spacing), not made.locked),
             ((self.view, self.picture_size), drawn and not made.locked),
             ((self.rate,), "film" in pictures and not made.locked),
             ((self.picture_format,), "frames" in pictures and not made.locked),
