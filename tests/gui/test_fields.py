@@ -209,6 +209,13 @@ def test_text_is_emitted_when_editing_is_finished(qtbot, lines):
     assert emitted == ["steel"]
 
 
+def test_beginning_of_a_long_text_is_shown(qtbot):
+    field = TextField("Title")
+    qtbot.addWidget(field)
+    field.set_value("One line on a GMAW pool")
+    assert field.editor.cursorPosition() == 0
+
+
 def test_long_path_shows_both_ends_until_edited(qtbot):
     field = PathField("Folder", tooltip="Where to")
     qtbot.addWidget(field)

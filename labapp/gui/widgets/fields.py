@@ -298,6 +298,8 @@ class TextField(Field):
         self._emitted = value
         if not typing and value != self.value():
             self._edit.setText(value)
+            if isinstance(self._edit, QLineEdit) and not self._edit.hasFocus():
+                self._edit.setCursorPosition(0)  # of a long text, its beginning is in view
 
     def flush(self) -> None:
         """Finish a current edit, as leaving the field does."""
