@@ -75,8 +75,15 @@ class Page(QWidget):
         on_done: Callable[[Any], None],
         kind: str = "",
         beside: Message | None = None,
+        once: bool = False,
     ) -> Task:
-        """Start work in the background, see `Tasks.start`; a failure is shown in `answer`."""
+        """Start work in the background, see `Tasks.start`; a failure is shown in `answer`.
+
+        ``once``: return the running work of this title, if there is any, and start no other.
+        """
+        running = (task for task in self.workspace.tasks.active if task.title == title)
+        if once and (task := next(running, None)) is not None:
+            return task
         say = self._answer_in(beside).setText
         return self.workspace.tasks.start(title, work, on_done, beside=say, kind=kind)
 

@@ -504,8 +504,10 @@ def test_correction_is_carried_to_later_frames_and_undone(
     messages: list[str] = []
     page.workspace.notified.connect(lambda words, problem: messages.append(words))
     earlier = session.correction(2)
-    key(page, Qt.Key.Key_Return, CONTROL)
+    for _ in range(3):  # a held key repeats
+        key(page, Qt.Key.Key_Return, CONTROL)
     qtbot.waitUntil(lambda: bool(messages))
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
     assert "Carried on over 3 frames, up to frame 5" in messages[0]
     assert session.corrected_frames().tolist() == [2, 3, 4, 5]
     assert unfitted == [[3, 4, 5]]

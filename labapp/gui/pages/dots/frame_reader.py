@@ -128,4 +128,5 @@ def carry_on(page: Page, seen: DotsState, most: int | None, answer: Message) -> 
         lambda control: presenter.carry(session, seen, most, control),
         finished,
         beside=answer,
+        once=True,
     )

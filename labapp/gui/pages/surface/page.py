@@ -337,7 +337,8 @@ class SurfacePage(Page):
         def done(_: object) -> None:
             self.confirm(f"Saved in {path}", self.saved)
 
-        self.start_task(f"Writing {path.name}", work, done, kind="Film", beside=self.saved)
+        title = f"Writing {path.name}"
+        self.start_task(title, work, done, kind="Film", beside=self.saved, once=True)
 
     def toggle_scale(self) -> None:
         """Switch between true heights and the previous exaggeration."""
