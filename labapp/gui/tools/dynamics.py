@@ -95,6 +95,7 @@ class DynamicsWindow(ToolWindow):
             table.itemSelectionChanged.connect(changed)
         self.events.cellActivated.connect(lambda *_: self.show_frame())
         self.tabs = QTabWidget()
+        self.tabs.tabBar().setAccessibleName("Parts of the analysis")
         for words, parts in (
             ("Spectrum", (self.peak_words, (self.spectrum, 1))),
             ("Modes", ((self.modes, 4), (self.shape, 7), hbox(self.play_button, 1))),

@@ -133,6 +133,7 @@ class StudyWindow(ToolWindow):
         plots = QWidget()
         vbox(line, (self.sheet, 1), of=plots)
         self.tabs = QTabWidget()
+        self.tabs.tabBar().setAccessibleName("Parts of the study")
         for widget, words in (
             (self.list, "Recordings"),
             (plots, "Plots"),
