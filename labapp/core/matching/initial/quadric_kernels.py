@@ -78,10 +78,11 @@ def reflect_off_quadrics(
 
 
 @_inner
-def _distance(one: FloatArray, other: FloatArray) -> float:
-    """Distance of two dots; infinite if either is NaN."""
-    distance = np.hypot(one[0] - other[0], one[1] - other[1])
-    return distance if np.isfinite(distance) else np.inf
+def _square_distance(one: FloatArray, other: FloatArray) -> float:
+    """Square of the distance of two dots; infinite if either is NaN."""
+    x, y = one[0] - other[0], one[1] - other[1]
+    square = x * x + y * y
+    return square if np.isfinite(square) else np.inf
 
 
 @_compiled(_f4, _f2, _mask, _f)
@@ -97,7 +98,7 @@ def match_predicted_dots(
     places
         Observed dots, shape (d, 2), mm.
     absent
-        Rays that the lens does not make, shape (rows, columns).
+        Rays that have no dot, or whose dots are not searched for, shape (rows, columns).
     gate
         Largest distance of a match, as a fraction of the distance to the nearest predicted dot of
         the row or the column.
@@ -106,7 +107,7 @@ def match_predicted_dots(
     -------
     hit, dot, off
         Whether an observed dot is within the gate; index of the nearest one; its distance in units
-        of the gate. Shape (m, rows, columns) each.
+        of the gate, infinite for absent rays. Shape (m, rows, columns) each.
     """
     count, rows, columns = pattern.shape[:3]
     hit = np.zeros((count, rows, columns), np.bool_)
@@ -116,25 +117,25 @@ def match_predicted_dots(
         for i in range(rows):
             for j in range(columns):
                 own = pattern[p, i, j]
-                if not (np.isfinite(own[0]) and np.isfinite(own[1])):
+                if absent[i, j] or not (np.isfinite(own[0]) and np.isfinite(own[1])):
                     continue
                 spacing = np.inf
                 if i > 0:
-                    spacing = min(spacing, _distance(own, pattern[p, i - 1, j]))
+                    spacing = min(spacing, _square_distance(own, pattern[p, i - 1, j]))
                 if i < rows - 1:
-                    spacing = min(spacing, _distance(own, pattern[p, i + 1, j]))
+                    spacing = min(spacing, _square_distance(own, pattern[p, i + 1, j]))
                 if j > 0:
-                    spacing = min(spacing, _distance(own, pattern[p, i, j - 1]))
+                    spacing = min(spacing, _square_distance(own, pattern[p, i, j - 1]))
                 if j < columns - 1:
-                    spacing = min(spacing, _distance(own, pattern[p, i, j + 1]))
+                    spacing = min(spacing, _square_distance(own, pattern[p, i, j + 1]))
                 least = np.inf
                 for k in range(len(places)):
                     x, y = own[0] - places[k, 0], own[1] - places[k, 1]
                     if x * x + y * y < least:
                         least = x * x + y * y
                         dot[p, i, j] = k
-                off[p, i, j] = np.sqrt(least) / max(gate * spacing, 1e-9)
-                hit[p, i, j] = off[p, i, j] < 1.0 and not absent[i, j]
+                off[p, i, j] = np.sqrt(least) / max(gate * np.sqrt(spacing), 1e-9)
+                hit[p, i, j] = off[p, i, j] < 1.0
     return hit, dot, off
 
 
@@ -260,8 +261,8 @@ def score_caps(
         for k in marked:
             nearest = np.inf
             for m in range(len(places)):
-                nearest = min(nearest, _distance(dots[k], places[m]))
-            shown += nearest < lit_gate * usual
+                nearest = min(nearest, _square_distance(dots[k], places[m]))
+            shown += np.sqrt(nearest) < lit_gate * usual
         score[c] = total - lit * shown / max(len(marked), 1)
     return score, labels
 

@@ -142,11 +142,7 @@ def _quadrics(window: _Window, holes: FloatArray, half_widths: FloatArray) -> Fl
     quadrics[:, :2] = np.repeat(slope[hole], len(_RATIOS), axis=0)
     quadrics[:, 2] = curvature
     quadrics[:, 4] = curvature * np.tile(_RATIOS, len(hole))
-    rays = window.rays[window.near]
-    patterns = window.intersect(quadrics, rays.reshape(-1, 3))[1].reshape(-1, *rays.shape[:2], 2)
-    hit = window.hits(patterns, LOOSE_GATE, window.absent[window.near])[0]
-    hit = hit[(slice(None), *window.core_of_near)]
-    return np.asarray(quadrics[hit.sum(axis=(1, 2)) >= CORE_LOOSE])
+    return window.with_core(quadrics, LOOSE_GATE, CORE_LOOSE)
 
 
 class _Window:
@@ -169,7 +165,9 @@ class _Window:
         self.core = slice(reach - 1, reach + 2), slice(reach - 1, reach + 2)
         rim = max(reach - 2, 0)  # the core, and the ring around it if there is one
         self.near = slice(rim, 2 * reach + 1 - rim), slice(rim, 2 * reach + 1 - rim)
-        self.core_of_near = tuple(slice(reach - 1 - rim, reach + 2 - rim) for _ in range(2))
+        core_of_near = tuple(slice(reach - 1 - rim, reach + 2 - rim) for _ in range(2))
+        self.not_core_of_near = np.ones(self.rays[self.near].shape[:2], bool)
+        self.not_core_of_near[core_of_near] = self.absent[self.core]
 
     def intersect(self, quadrics: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Reflection points of n rays on m quadrics, and their dots.
@@ -194,34 +192,41 @@ class _Window:
 
         return quadric_kernels.match_predicted_dots(pattern, self.observed.plane_mm, absent, gate)
 
+    def with_core(self, quadrics: FloatArray, gate: float, least: int) -> FloatArray:
+        """Quadrics with which at least so many of the rays next to the reference have a dot."""
+        rays = self.rays[self.near]
+        patterns = self.intersect(quadrics, rays.reshape(-1, 3))[1]
+        hit = self.hits(patterns.reshape(-1, *rays.shape[:2], 2), gate, self.not_core_of_near)[0]
+        return np.asarray(quadrics[hit.sum(axis=(1, 2)) >= least])
+
     def fitted(self, quadrics: FloatArray) -> FloatArray:
         """Fit quadrics to the dots that match their rays next to the reference."""
         from labapp.core.matching.initial import quadric_kernels
 
         laser, places = self.observed.rig.laser.position_mm, self.observed.plane_mm
         center = self.landing_mm[:2]
+        rays, others = self.rays[self.near], self.not_core_of_near
         return quadric_kernels.fit_quadrics(
-            center, quadrics, self.rays, laser, self.plane, places, self.absent, LOOSE_GATE
+            center, quadrics, rays, laser, self.plane, places, others, LOOSE_GATE
         )
 
     def scored(self, quadrics: FloatArray) -> Iterator[QuadricLabels]:
         """Yield the labels of each quadric that explains the dots around the hole."""
+        quadrics = self.with_core(quadrics, TIGHT_GATE, CORE_TIGHT)
         patterns = self.intersect(quadrics, self.rays.reshape(-1, 3))[1]
         patterns = patterns.reshape(-1, *self.rays.shape[:2], 2)
         hit, dot, off = self.hits(patterns, TIGHT_GATE, self.absent)
         core = (slice(None), *self.core)
-        explains = np.flatnonzero(hit[core].sum(axis=(1, 2)) >= CORE_TIGHT)
-        seen = self.observed.in_view(np.nan_to_num(patterns[core][explains], nan=1e6))
+        seen = self.observed.in_view(np.nan_to_num(patterns[core], nan=1e6))
         # A ray next to the hole that should have a dot but has none is evidence against the
         # quadric.
-        silent = seen & ~self.absent[self.core] & ~hit[core][explains]
-        for k, count in zip(explains, silent.sum(axis=(1, 2)).tolist(), strict=True):
+        silent = seen & ~self.absent[self.core] & ~hit[core]
+        for k, count in enumerate(silent.sum(axis=(1, 2)).tolist()):
             yield self._labels(hit[k], dot[k], off[k], count)
 
     def _labels(self, hit: BoolArray, dot: IntArray, off: FloatArray, silent: int) -> QuadricLabels:
-        matched = np.where(hit, dot, UNLABELLED)
-        chosen, count = np.unique(matched[hit], return_counts=True)
-        matched[np.isin(matched, chosen[count > 1])] = UNLABELLED
+        is_shared = np.bincount(dot[hit])[np.where(hit, dot, dot[hit][0])] > 1
+        matched = np.where(hit & ~is_shared, dot, UNLABELLED)
         nearness = 1 - np.mean(off[hit])
         # Farther out the pool is not a quadric, and dots of the next row may be matched instead.
         core = (self.core[0], slice(self.core[1].start - 1, self.core[1].stop + 1))
