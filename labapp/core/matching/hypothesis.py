@@ -79,6 +79,9 @@ prediction."""
 SHIFTS = tuple((i, j) for i, j in product(range(-2, 3), repeat=2) if 0 < abs(i) + abs(j) < 3)
 """Rows and columns by which labels are shifted."""
 
+MOST_KEPT = 50
+"""Number of evaluated hypotheses of a frame that are kept: their surfaces have some 20 MB."""
+
 AGREED = 0.8
 """Minimum share of the dots of a hypothesis in the lattice that must have the same offset of rays
 from sites."""
@@ -169,10 +172,16 @@ def grow_and_evaluate(
     labels: IntArray,
     fit_settings: FitSettings = USUAL_FIT,
     knot_mm: float | None = None,
+    least: int = 0,
 ) -> Hypothesis | None:
-    """Grow labels (`grow_labels`) and evaluate the result; None if no surface fits it."""
+    """Grow labels (`grow_labels`) and evaluate the result.
+
+    None if no surface fits it, or it has fewer labels than ``least``.
+    """
     grown = grow_labels(observed, labels, knot_mm)
-    hypothesis = None if grown is None else evaluate(observed, grown, fit_settings)
+    if grown is None or count_labels(grown) < least:
+        return None
+    hypothesis = evaluate(observed, grown, fit_settings)
     if hypothesis is None:
         return None
     outside = _outside(observed, hypothesis)
@@ -181,7 +190,7 @@ def grow_and_evaluate(
         return hypothesis
     labels = hypothesis.labels.copy()
     labels[outside[:, 0], outside[:, 1]] = UNLABELLED
-    return evaluate(observed, labels, fit_settings)
+    return None if count_labels(labels) < least else evaluate(observed, labels, fit_settings)
 
 
 def _outside(observed: Observation, hypothesis: Hypothesis) -> IntArray:
@@ -203,8 +212,22 @@ def evaluate(
 ) -> Hypothesis | None:
     """Fit the surface to given labels and compute their cost; None if no surface fits them.
 
-    The fit starts from ``initial``, which saves rounds if it is close.
+    The fit starts from ``initial``, which saves rounds if it is close. Different ways often lead to
+    the same labels: the last `MOST_KEPT` results are kept.
     """
+    known, key = observed.evaluated, (labels.tobytes(), fit_settings)
+    if key not in known:
+        if len(known) == MOST_KEPT:
+            del known[next(iter(known))]
+        known[key] = _evaluated(observed, labels, fit_settings, initial)
+    found: Hypothesis | None = known[key]
+    return found and replace(found)  # hypotheses are told apart by identity
+
+
+def _evaluated(
+    observed: Observation, labels: IntArray, fit_settings: FitSettings, initial: FittedPool | None
+) -> Hypothesis | None:
+    """`evaluate` without results of before."""
     pool = try_fit(observed, labels, initial=initial)
     if pool is None:
         return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -189,6 +190,11 @@ class Observation(ReadOnlyArrays):
 
     @cached_property
     def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | tuple[str, str]]:
+        return {}
+
+    @cached_property
+    def evaluated(self) -> dict[tuple[bytes, FitSettings], Any]:
+        """The last results of `hypothesis.evaluate`, by the labels and settings of the fit."""
         return {}
 
     @cached_property

@@ -175,7 +175,7 @@ def _rows_begun(observed: Observation, hypothesis: Hypothesis) -> list[Hypothesi
             continue
         more = labels.copy()
         more[at] = stray[dot]
-        wider = grow_and_evaluate(observed, more)
-        if wider is not None and wider.label_count >= hypothesis.label_count + LEAST_ROW:
+        wider = grow_and_evaluate(observed, more, least=hypothesis.label_count + LEAST_ROW)
+        if wider is not None:
             found.append(wider)
     return found
