@@ -238,11 +238,16 @@ def _cheapest(
     near = any(rival.cost < best.cost + CLOSE_COST for rival in neighbours or ())
     if near or best.residual_rms_mm > KNOT_ERROR_MM:
         fit_settings, neighbours = FINE_FIT, None
-        found = [
-            h
+        fine = evaluate_averaged(observed, best.labels, fit_settings, best.pool)
+        # The mean is at least half of the usual cost: hypotheses above this are no rivals.
+        most = np.inf if fine is None else 2 * (fine.cost + 2 * margin)
+        averaged = (
+            each
+            if each.cost_without_marker > most
+            else evaluate_averaged(observed, each.labels, fit_settings, each.pool)
             for each in found
-            if (h := evaluate_averaged(observed, each.labels, fit_settings, each.pool))
-        ]
+        )
+        found = [hypothesis for hypothesis in averaged if hypothesis]
         best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
     if neighbours is None and not _beyond_doubt(observed, best, margin):
         best, neighbours = _with_neighbours(observed, best, fit_settings)
