@@ -6,6 +6,7 @@ curvature makes the surface continue as a quadric where no ray came back.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -119,14 +120,10 @@ class SplineBasis(ReadOnlyArrays):
     @classmethod
     def over(cls, low_mm: FloatArray, high_mm: FloatArray, knot_mm: float) -> SplineBasis:
         """Build the basis on the rectangle from ``low_mm`` to ``high_mm``, each shape (2,)."""
-        knots = []
-        for low, high in zip(low_mm, high_mm, strict=True):
-            cells = max(2, int(np.ceil((high - low) / knot_mm)))
-            step = (high - low) / cells
-            knots.append(low + step * np.arange(-DEGREE, cells + DEGREE + 1))
-        return cls(*knots)
+        ends = zip(low_mm.tolist(), high_mm.tolist(), strict=True)
+        return _basis_over(*ends, knot_mm)
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, int]:
         """Number of splines along x and along y."""
         return len(self.x_knots) - DEGREE - 1, len(self.y_knots) - DEGREE - 1
@@ -199,6 +196,19 @@ class SplineBasis(ReadOnlyArrays):
         Lower band, shape (width + 1, splines), in LAPACK's storage.
         """
         return _roughness_matrix(*self.shape, *self.step_mm.tolist())
+
+
+@lru_cache(maxsize=64)
+def _basis_over(
+    along_x: tuple[float, float], along_y: tuple[float, float], knot_mm: float
+) -> SplineBasis:
+    """`SplineBasis.over`; kept, as many fits of a frame have the same outermost rays."""
+    knots: list[FloatArray] = []
+    for low, high in (along_x, along_y):
+        cells = max(2, math.ceil((high - low) / knot_mm))
+        step = (high - low) / cells
+        knots.append(low + step * np.arange(-DEGREE, cells + DEGREE + 1.0))
+    return SplineBasis(*knots)
 
 
 @dataclass(frozen=True)
