@@ -17,7 +17,14 @@ import scipy
 
 from labapp.core.images.dots import Dots
 from labapp.core.rows.lattice import Lattice, Site, find_holes, lattice_of_sites
-from labapp.core.values import BoolArray, CannotMeasure, ComplexArray, FloatArray, IntArray
+from labapp.core.values import (
+    BoolArray,
+    CannotMeasure,
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    median,
+)
 
 MOST_STEPS = 1000
 """Largest number of steps that a grid grows from its seed."""
@@ -305,8 +312,8 @@ def _without_slips(grid: IntArray, dots_px: ComplexArray) -> IntArray:
         lean = (np.diff(place, axis=0) / _steps_along(place[:-1])).real
     slant = np.full(len(grid), np.nan)
     for k in np.nonzero(~np.isnan(lean).all(axis=1))[0]:
-        slant[k + 1] = np.median(lean[k][~np.isnan(lean[k])])
-    median_slant = np.median(slant[~np.isnan(slant)]) if not np.isnan(slant).all() else 0.0
+        slant[k + 1] = median(lean[k][~np.isnan(lean[k])])
+    median_slant = median(slant[~np.isnan(slant)]) if not np.isnan(slant).all() else 0.0
     sound = (np.abs(slant - median_slant) < MOST_SLIP) & (np.abs(slant) < MOST_SLANT)
     part = np.cumsum(~sound)
     kept: BoolArray = part == np.bincount(part, (grid >= 0).sum(axis=1)).argmax()
