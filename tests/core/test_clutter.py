@@ -75,6 +75,15 @@ def test_holes_ambiguous_within_setup_uncertainty_are_rejected(kind: str, seed: 
     assert result_with_setup_errors(kind, seed).status == "ambiguous-rows"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "seed"), [("cap", 6728), ("rippled", 6735)])
+def test_likeliest_setup_is_reached_in_several_steps(kind: str, seed: int) -> None:
+    """After one step, every label was a row or a column off."""
+    rig, seen, pool = draw(kind, seed, 0.05, 12)
+    got = measure_pool(pool, seen, with_setup_errors(rig, seed, 1.0))
+    assert got.status == "ambiguous-rows"
+
+
 def test_free_setup_costs_no_more_than_the_entered_one() -> None:
     """The step to another set-up lowers residuals, but may raise the other parts of the cost."""
     rig, seen, _ = draw("dented", 12019, 0.0, 0)
@@ -84,8 +93,7 @@ def test_free_setup_costs_no_more_than_the_entered_one() -> None:
     assert right is not None
     entered = evaluate_averaged(observed, right.labels, FINE_FIT, right.pool)
     assert entered is not None
-    free = with_setup_free(observed, right, FINE_FIT)
-    assert free.cost <= free.given_cost <= entered.cost + 0.01
+    assert with_setup_free(observed, right, FINE_FIT).cost <= entered.cost + 0.01
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("cap", 5000), ("egg", 5001), ("concave", 5005)])

@@ -153,7 +153,7 @@ def _with_rivals(
             with_marker = rival.cost - cheapest.cost
             without = rival.cost_without_marker - cheapest.cost_without_marker
             cost = open_holes[0].cost + min(with_marker, without)
-            open_holes = [*open_holes, FreeHypothesis(rival.labels, step, cost, cost)]
+            open_holes = [*open_holes, FreeHypothesis(rival.labels, step, cost)]
     return open_holes
 
 

@@ -2,8 +2,9 @@
 
 If the set-up is wrong, labels shifted by a row or a column may have smaller residuals than correct
 ones: a shift of the labels moves dots much as an error of the set-up by a fraction of the spacing
-of the rays does. Hypotheses are therefore compared with a free set-up: each uses the set-up with
-which it is likeliest, and its cost includes the deviation of this set-up from the given one.
+of the rays does. Hypotheses are therefore compared with a free set-up: each uses the set-up as
+entered or the one with which it is likeliest, which costs more. Rows that fit the set-up as entered
+as well as any other are therefore preferred: wrong rows hardly ever do.
 
 Holes are distinguished by the boundary, the smoothness of the surface and the uncertainty of the
 set-up. The residuals hardly contribute: the surface follows the dots of either hypothesis about
@@ -25,13 +26,17 @@ from labapp.core.matching.hypothesis import (
     evaluate,
     evaluate_averaged,
     grow_and_evaluate,
+    roughness_weight,
     shifted_by,
     variance_mm2,
 )
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
-from labapp.core.surface.pool_fit import FitSettings
-from labapp.core.surface.setup_uncertainty import perturbed, residual_changes
-from labapp.core.values import IntArray
+from labapp.core.surface.pool_fit import FitSettings, FittedPool
+from labapp.core.surface.setup_uncertainty import fit_changes, perturbed
+from labapp.core.values import FloatArray, IntArray
+
+MOST_STEPS, LEAST_GAIN = 4, 1.0
+"""Largest number of steps to the likeliest set-up; decrease of the cost that justifies another."""
 
 
 @dataclass(frozen=True)
@@ -44,15 +49,12 @@ class FreeHypothesis:
         The given labels, or those grown from them with that set-up if these cost less.
     step
         Rows and columns by which the labels are shifted from those of the best hypothesis.
-    given_cost
-        Cost of the given labels, in units of χ²; infinite without a surface.
     cost
         Cost of `labels`, in units of χ²; infinite without a surface.
     """
 
     labels: IntArray
     step: tuple[int, int] = (0, 0)
-    given_cost: float = np.inf
     cost: float = np.inf
 
 
@@ -87,9 +89,9 @@ def holes_left_open(
     own = with_setup_free(observed, best, fit_settings)
     rivals = []
     for step in steps:
-        shifted = evaluate(observed, shifted_by(observed, best.labels, step))
+        shifted = evaluate(observed, shifted_by(observed, own.labels, step))
         if shifted is not None:
-            rival = with_setup_free(observed, shifted, fit_settings, own.given_cost + margin)
+            rival = with_setup_free(observed, shifted, fit_settings, own.cost + margin)
             if rival.cost < own.cost + margin:
                 rivals.append(replace(rival, step=step))
     return [own, *rivals] if rivals else []
@@ -106,40 +108,99 @@ def _steps_to_other_holes(observed: Observation, best: Hypothesis) -> list[tuple
 def with_setup_free(
     observed: Observation, hypothesis: Hypothesis, fit_settings: FitSettings, most: float = np.inf
 ) -> FreeHypothesis:
-    """Evaluate labels with the set-up with which they are likeliest.
+    """Evaluate labels with the set-up as entered or, if that costs less, the likeliest one.
 
-    One Gauss–Newton step minimises the sum of the squared residuals and squared deviations of the
-    set-up, both in σ, while the surface is refitted. It disregards the other parts of the cost: if
-    these increase by more, the set-up stays as entered. Costs are infinite without a surface, and
-    if the cost of the given labels is not below ``most``.
+    The likeliest set-up within its uncertainty costs the squared deviation in σ and, as it can fit
+    anything better, the logarithm of the determinant of its normal matrix (Laplace's approximation
+    of the integral over the deviations). Costs are infinite without a surface, and if the cost of
+    the given labels is not below ``most``.
     """
     labels, uncertainty = hypothesis.labels, observed.rig.uncertainty
     pool = try_fit(observed, labels, USUAL_FIT, hypothesis.pool)
     if pool is None or uncertainty is None:
         return FreeHypothesis(labels)
-    at = np.argwhere(labels != UNLABELLED)
-    dot = labels[tuple(at.T)]
+    entered = evaluate_averaged(observed, labels, fit_settings, pool)
+    if entered is None:
+        return FreeHypothesis(labels)
+    cost, setup_cost, likeliest = entered.cost, 0.0, observed
+    moved = _with_likeliest_setup(observed, hypothesis, pool, entered.cost, fit_settings)
+    if moved[0] < cost:
+        cost, setup_cost, likeliest = moved
+    if cost >= most:
+        return FreeHypothesis(labels)
+    more = grow_and_evaluate(likeliest, labels)
+    grown = more and evaluate_averaged(likeliest, more.labels, fit_settings, more.pool)
+    if grown and grown.cost + setup_cost < cost:
+        return FreeHypothesis(grown.labels, cost=grown.cost + setup_cost)
+    return FreeHypothesis(labels, cost=cost)
+
+
+def _with_likeliest_setup(
+    observed: Observation,
+    hypothesis: Hypothesis,
+    pool: FittedPool,
+    cost: float,
+    fit_settings: FitSettings,
+) -> tuple[float, float, Observation]:
+    """Cost of labels with the likeliest set-up, the set-up's share of it, and the dots with it.
+
+    Gauss–Newton steps lead to this set-up, as long as each lowers the cost by `LEAST_GAIN`. The
+    surface and its cost are given for the set-up as entered.
+    """
+    assert observed.rig.uncertainty is not None
+    moved, deviation = observed, np.zeros(observed.rig.uncertainty.root.shape[1])
+    square = log_determinant = 0.0
+    for _ in range(MOST_STEPS):
+        step, log_determinant = _step(moved, hypothesis, pool, deviation)
+        further = _with_deviation(observed, deviation + step)
+        fitted = try_fit(further, hypothesis.labels, USUAL_FIT, pool)
+        if fitted is None:
+            break
+        found = evaluate_averaged(further, hypothesis.labels, fit_settings, fitted)
+        length = float(np.sum((deviation + step) ** 2))
+        if found is None or found.cost + length > cost:
+            break
+        gain = cost - (found.cost + length)
+        moved, deviation, pool, square = further, deviation + step, fitted, length
+        cost = found.cost + square
+        if gain < LEAST_GAIN:
+            break
+    return cost + log_determinant, square + log_determinant, moved
+
+
+def _with_deviation(observed: Observation, deviation: FloatArray) -> Observation:
+    """The dots with the set-up changed by a deviation in σ of its independent errors, (q,)."""
+    uncertainty = observed.rig.uncertainty
+    assert uncertainty is not None
+    rig, plane_mm = perturbed(observed.rig, uncertainty.root @ deviation, observed.plane_mm)
+    return replace(observed, bench=Bench(rig, observed.bench.calibration), plane_mm=plane_mm)
+
+
+def _step(
+    observed: Observation, hypothesis: Hypothesis, pool: FittedPool, deviation: FloatArray
+) -> tuple[FloatArray, float]:
+    """Gauss–Newton step of the set-up's deviation from the entered one, in σ.
+
+    It minimises the sum of squared residuals and squared deviations, both in σ, and the cost of the
+    roughness, while the surface is refitted. ``pool`` is fitted with the present deviation.
+
+    Returns
+    -------
+    step, log_determinant
+        The step, shape (q,), and the logarithm of the determinant of the normal matrix.
+    """
+    at = np.argwhere(hypothesis.labels != UNLABELLED)
+    dot = hypothesis.labels[tuple(at.T)]
     sigma = np.repeat(np.sqrt(variance_mm2(observed, dot)), 2)
     matched = MatchedDots(
         at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot], hypothesis.witness
     )
-    change = residual_changes(matched, observed.rig, USUAL_FIT, pool).reshape(len(sigma), -1)
+    residuals, coefficients = fit_changes(matched, observed.rig, USUAL_FIT, pool)
+    change = residuals.reshape(len(sigma), -1)
     finite = np.isfinite(change).all(axis=1)  # a ray at the rim may leave the splines
     jacobian = change[finite] / sigma[finite, None]
-    rhs = -jacobian.T @ (pool.residual_mm.ravel() / sigma)[finite]
-    deviation = np.linalg.solve(jacobian.T @ jacobian + np.eye(len(rhs)), rhs)
-    rig, plane_mm = perturbed(observed.rig, uncertainty.root @ deviation, observed.plane_mm)
-    moved = replace(observed, bench=Bench(rig, observed.bench.calibration), plane_mm=plane_mm)
-    setup_cost = float(deviation @ deviation)
-    entered = evaluate_averaged(observed, labels, fit_settings, pool)
-    found = evaluate_averaged(moved, labels, fit_settings, pool)
-    if found is None or entered is None:
-        return FreeHypothesis(labels)
-    given_cost = min(found.cost + setup_cost, entered.cost)
-    if given_cost >= most:
-        return FreeHypothesis(labels)
-    more = grow_and_evaluate(moved, labels)
-    grown = more and evaluate_averaged(moved, more.labels, fit_settings, more.pool)
-    if grown and grown.cost + setup_cost < given_cost:
-        return FreeHypothesis(grown.labels, given_cost=given_cost, cost=grown.cost + setup_cost)
-    return FreeHypothesis(labels, given_cost=given_cost, cost=given_cost)
+    rough = roughness_weight(pool, USUAL_FIT) * pool.surface.basis.roughness_products(coefficients)
+    normal = jacobian.T @ jacobian + np.eye(len(deviation)) + coefficients.T @ rough
+    rhs = jacobian.T @ (pool.residual_mm.ravel() / sigma)[finite] + deviation
+    rhs += rough.T @ pool.surface.coefficients
+    return -np.linalg.solve(normal, rhs), float(np.linalg.slogdet(normal).logabsdet)

@@ -318,8 +318,17 @@ def _roughness_cost(pool: FittedPool, fit_settings: FitSettings) -> float:
 
     Wrong labels nearly always need a rougher surface than correct ones.
     """
-    ratio = CORRELATED_MM2 / fit_settings.jerk**2 * pool.surface.roughness() / ROUGHNESS_FREEDOM
-    return ROUGHNESS_FREEDOM * float(np.log1p(ratio))
+    return ROUGHNESS_FREEDOM * float(np.log1p(_roughness_ratio(pool, fit_settings)))
+
+
+def roughness_weight(pool: FittedPool, fit_settings: FitSettings) -> float:
+    """Derivative of the cost of a surface's roughness by the roughness, mm²."""
+    return CORRELATED_MM2 / fit_settings.jerk**2 / (1 + _roughness_ratio(pool, fit_settings))
+
+
+def _roughness_ratio(pool: FittedPool, fit_settings: FitSettings) -> float:
+    """A surface's roughness in units of the expected one, per `ROUGHNESS_FREEDOM`."""
+    return CORRELATED_MM2 / fit_settings.jerk**2 * pool.surface.roughness() / ROUGHNESS_FREEDOM
 
 
 def _marker_state(observed: Observation, lit: BoolArray, pool: FittedPool) -> Marker | None:

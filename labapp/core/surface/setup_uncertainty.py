@@ -84,18 +84,19 @@ def setup_changes(
     return changes
 
 
-def residual_changes(
+def fit_changes(
     match: Match | MatchedDots, rig: Rig, settings: FitSettings, pool: FittedPool
-) -> FloatArray:
-    """Changes of a fit's residuals due to each independent error component of the bench.
+) -> tuple[FloatArray, FloatArray]:
+    """Changes of a fit due to each independent error component of the bench.
 
     The surface is refitted to the n matched pairs; the rig must have an uncertainty. Parameters are
     those of `setup_changes`.
 
     Returns
     -------
-    FloatArray
-        Shape (n, 2, q), mm, with one entry per column of `RigUncertainty.root`.
+    residuals, coefficients
+        Their changes, shapes (n, 2, q) and (p, q), mm, with one entry per column of
+        `RigUncertainty.root`.
     """
     from labapp.core.surface.kernels import ray_kernels
 
@@ -105,6 +106,8 @@ def residual_changes(
     equations = _factorised(match, rig, settings, pool)
     responses = _response(match.ray, equations, pool, benches)
     changes = np.zeros((*match.plane_mm.shape, len(rig.uncertainty.root)))
+    of_coefficients = np.zeros((len(surface.coefficients), len(rig.uncertainty.root)))
+    of_coefficients[:, columns] = responses.T / SHARE
     for k, change, (bench, plane_mm) in zip(columns, responses, benches, strict=True):
         rays, plane = project_rays(bench.laser, bench.pattern), bench.imaging_plane.pose_mm
         directions, landing = rays.directions[at], rays.landing_mm[at]
@@ -114,7 +117,7 @@ def residual_changes(
         )
         off = computed - plane_mm - pool.residual_mm
         changes[..., k] = off / SHARE
-    return changes
+    return changes, of_coefficients
 
 
 def _benches(rig: Rig, plane_mm: FloatArray) -> tuple[IntArray, list[tuple[Rig, FloatArray]]]:

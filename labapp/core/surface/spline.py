@@ -197,6 +197,15 @@ class SplineBasis(ReadOnlyArrays):
         """
         return _roughness_matrix(*self.shape, *self.step_mm.tolist())
 
+    def roughness_products(self, coefficients: FloatArray) -> FloatArray:
+        """Products Pc of the matrix with coefficients, shape (splines,) or (splines, m)."""
+        band = self.roughness_matrix
+        columns = coefficients.reshape(self.count, -1).T
+        products = [
+            scipy.linalg.blas.dsbmv(len(band) - 1, 1.0, band, one, lower=1) for one in columns
+        ]
+        return np.reshape(np.transpose(products), coefficients.shape)
+
 
 @lru_cache(maxsize=64)
 def _basis_over(
@@ -252,5 +261,4 @@ class SplineSurface(ReadOnlyArrays):
 
     def roughness(self) -> float:
         """∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² over the rectangle, mm⁻²."""
-        band, c = self.basis.roughness_matrix, self.coefficients
-        return float(c @ scipy.linalg.blas.dsbmv(len(band) - 1, 1.0, band, c, lower=1))
+        return float(self.coefficients @ self.basis.roughness_products(self.coefficients))
