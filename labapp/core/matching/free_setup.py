@@ -35,8 +35,9 @@ from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.surface.setup_uncertainty import fit_changes, perturbed
 from labapp.core.values import FloatArray, IntArray
 
-MOST_STEPS, LEAST_GAIN = 4, 1.0
-"""Largest number of steps to the likeliest set-up; decrease of the cost that justifies another."""
+MOST_STEPS, LEAST_GAIN, MOST_GAIN = 4, 1.0, 30.0
+"""Largest number of steps to the likeliest set-up; decrease of the cost that justifies another; and
+the most that all steps after the first were seen to gain, in units of χ²."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def with_setup_free(
     if entered is None:
         return FreeHypothesis(labels)
     cost, setup_cost, likeliest = entered.cost, 0.0, observed
-    moved = _with_likeliest_setup(observed, hypothesis, pool, entered.cost, fit_settings)
+    moved = _with_likeliest_setup(observed, hypothesis, pool, entered.cost, fit_settings, most)
     if moved[0] < cost:
         cost, setup_cost, likeliest = moved
     if cost >= most:
@@ -141,11 +142,13 @@ def _with_likeliest_setup(
     pool: FittedPool,
     cost: float,
     fit_settings: FitSettings,
+    most: float,
 ) -> tuple[float, float, Observation]:
     """Cost of labels with the likeliest set-up, the set-up's share of it, and the dots with it.
 
-    Gauss–Newton steps lead to this set-up, as long as each lowers the cost by `LEAST_GAIN`. The
-    surface and its cost are given for the set-up as entered.
+    Gauss–Newton steps lead to this set-up, as long as each lowers the cost by `LEAST_GAIN`, and the
+    cost may become less than ``most``. The surface and its cost are given for the set-up as
+    entered.
     """
     assert observed.rig.uncertainty is not None
     moved, deviation = observed, np.zeros(observed.rig.uncertainty.root.shape[1])
@@ -163,7 +166,7 @@ def _with_likeliest_setup(
         gain = cost - (found.cost + length)
         moved, deviation, pool, square = further, deviation + step, fitted, length
         cost = found.cost + square
-        if gain < LEAST_GAIN:
+        if gain < LEAST_GAIN or cost + log_determinant > most + MOST_GAIN:
             break
     return cost + log_determinant, square + log_determinant, moved
 
