@@ -61,8 +61,8 @@ def draw_view(rng: np.random.Generator) -> CameraView:
     )
 
 
-def measured(kind: str, seed: int) -> tuple[PoolResult, float]:
-    """Return the result for one frame, and its processor time, s."""
+def measured(kind: str, seed: int, *, is_exact: bool = False) -> tuple[PoolResult, float]:
+    """Return the result for one frame, with an exact or an uncertain set-up, and its time, s."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind), 1])
     rig, pool = draw_pool(kind, rng)
     view = draw_view(rng)
@@ -70,7 +70,7 @@ def measured(kind: str, seed: int) -> tuple[PoolResult, float]:
     shown = int(frame.shown.sum())
     axes = (view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm)
     calibration = ImageCalibration.from_three_points(*axes)
-    bench = Bench(as_entered(rig, calibration), calibration)
+    bench = Bench(rig if is_exact else as_entered(rig, calibration), calibration)
     start_s = time.process_time()
     result = measure(frame.image, bench, Settings())[0]
     took_s = time.process_time() - start_s
