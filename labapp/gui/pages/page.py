@@ -139,7 +139,7 @@ class Page(QWidget):
         """Stop all that only this page needs, when it is hidden or the window closes."""
 
     def take(self, path: Path, at_once: bool = False) -> None:
-        """Accept a recording dropped on the window or chosen in its menu; for ``capture``.
+        """Accept a file dropped on the window or chosen in its menu; see `files.TAKEN_BY`.
 
         The page is in view. ``at_once``: import the whole recording, and go on to its dots.
         """

@@ -24,13 +24,19 @@ if TYPE_CHECKING:
     from labapp.session.session import Session
 
 
+TAKEN_BY = {".toml": "setup", **dict.fromkeys((".csv", ".txt", ".tsv", ".tdms"), "trends")}
+"""Steps that take the files that are no recordings, by the files' suffixes."""
+
+NO_SESSION = "Open a recording or a session first: the file is for it"
+
+
 class Files(QObject):
     """Opening and creation of files by the window."""
 
-    recording_requested = Signal(object, bool)
-    """The step Recording is to be shown and to take this file or folder, unless it is None.
+    step_requested = Signal(str, object, bool)
+    """This step is to be shown and to take this file or folder, unless it is None.
 
-    The second argument tells whether it is to be imported immediately.
+    The last argument tells whether a recording is to be imported immediately.
     """
     refused = Signal(str)
     """Reason why an action of the welcome page was refused; empty if it was not."""
@@ -91,7 +97,7 @@ class Files(QObject):
             )
             if session is not None:
                 self._show(session, recording.parent)
-                self.recording_requested.emit(recording, True)
+                self.step_requested.emit("capture", recording, True)
 
         title = f"Opening {recording.name}"
         self.workspace.tasks.start(
@@ -141,11 +147,18 @@ class Files(QObject):
             self.take(path)
 
     def open_path(self, path: Path) -> None:
-        """Open a session, or import anything else."""
-        if path.suffix.lower() == SUFFIX:
+        """Open a session, pass a set-up or a table to its step, or import anything else."""
+        suffix = path.suffix.lower()
+        step = TAKEN_BY.get(suffix)
+        if suffix == SUFFIX:
             self.open(path)
-        else:
+        elif step is None or path.is_dir():
             self.take(path)
+        elif self.workspace.session is None:
+            self.refused.emit(NO_SESSION)
+            self.workspace.notified.emit(NO_SESSION, True)
+        else:
+            self.step_requested.emit(step, path, False)
 
     def open_dropped(self, paths: Sequence[Path]) -> None:
         """Open a dropped file or folder after the other program has got its pointer back."""
@@ -177,7 +190,7 @@ class Files(QObject):
         else:
             folder = str(path.parent)
             self.preferences.remember(lambda before: replace(before, last_folder=folder))
-            self.recording_requested.emit(path, False)
+            self.step_requested.emit("capture", path, False)
 
     def save_copy(self) -> None:
         """Ask for a file and save a copy of the current session in it."""
@@ -211,7 +224,7 @@ class Files(QObject):
         session = self.workspace.run_or_report(lambda: next_session(present, path))
         if session is not None:
             self._show(session)
-            self.recording_requested.emit(None, False)
+            self.step_requested.emit("capture", None, False)
 
     def try_sample(self, name: str = "gtaw") -> None:
         """Open a copy of a sample session in one of the user's folders."""

@@ -140,7 +140,7 @@ class MainWindow(QMainWindow):
         space, preferences = self.workspace, self.preferences
         preferences.changed.connect(lambda: self.menus.show_recent(preferences.current.recent))
         preferences.failed.connect(self.say)
-        self.files.recording_requested.connect(self._show_recording)
+        self.files.step_requested.connect(self._show_file)
         self.files.refused.connect(self.welcome.refused.setText)
         self.setups.answered.connect(self.show_answer)
         space.closing.connect(self._leave)
@@ -265,9 +265,9 @@ class MainWindow(QMainWindow):
         else:
             self.workspace.show_frame(found)
 
-    def _show_recording(self, path: Path | None, at_once: bool) -> None:
-        """Show the step Recording, and pass a recording to its page."""
-        self.show_step("capture")
+    def _show_file(self, step: str, path: Path | None, at_once: bool) -> None:
+        """Show a step, and pass a file to its page."""
+        self.show_step(step)
         if path is not None and self.page is not None:
             self.page.take(path, at_once)
 

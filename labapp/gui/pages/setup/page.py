@@ -140,6 +140,11 @@ class SetupPage(Page):
         ):
             self.confirm(f"Set-up loaded from {path.name}")
 
+    def take(self, path: Path, at_once: bool = False) -> None:
+        """Load the setup from a dropped file, in the tab that shows it."""
+        self.tabs.setCurrentIndex(BENCH_TAB)
+        self.load(path)
+
     def save(self, path: Path) -> None:
         """Write the setup to a file."""
         content = self.session.setup_text.encode()

@@ -156,6 +156,10 @@ class TrendsPage(Page):
         """Read a table with current and voltage, and store it in the session."""
         self._keep(f"Reading {path.name}", lambda: read_signals(path))
 
+    def take(self, path: Path, at_once: bool = False) -> None:
+        """Read a dropped table with current and voltage."""
+        self.read_signals(path)
+
     def _start_at(self, start_s: object) -> None:
         signals = self.session.signals
         if signals is not None and isinstance(start_s, int | float):
