@@ -45,6 +45,14 @@ def test_trends_of_the_sample(gtaw: Path) -> None:
     assert shown.signals_words.startswith("None.")
 
 
+def test_trends_of_a_concave_pool_show_its_depth(copy_sample) -> None:
+    with Session.open(copy_sample("concave")) as session:
+        names = [curve.name for curve in show(session, TrendOptions()).curves]
+        assert names == ["Width", "Length", "Depth", "ARE"]
+        chosen = show(session, TrendOptions(shown=("height_mm",))).curves
+        assert [curve.name for curve in chosen] == ["Height"]
+
+
 def test_marks_show_the_status_of_frames(copy_sample) -> None:
     with Session.open(copy_sample("blocked_rows")) as session:
         curve = show(session, TrendOptions()).curves[0]
@@ -128,6 +136,21 @@ def test_checked_measures_are_shown(page: TrendsPage) -> None:
     for box in page._boxes.values():
         box.setChecked(False)
     assert page.nothing.isVisibleTo(page)
+
+
+def test_boxes_follow_the_kind_of_pool_until_one_is_clicked(page: TrendsPage, copy_sample) -> None:
+    def ticked() -> set[str]:
+        return {key for key, box in page._boxes.items() if box.isChecked()}
+
+    assert {"height_mm", "current"} <= ticked()
+    assert "depth_mm" not in ticked()
+    page.workspace.show(Session.open(copy_sample("concave")))
+    page.refresh()
+    assert "depth_mm" in ticked()
+    assert "height_mm" not in ticked()
+    page._boxes["depth_mm"].click()
+    page.refresh()
+    assert not {"height_mm", "depth_mm"} & ticked()
 
 
 def test_spectrum_can_be_shown_and_hidden(page: TrendsPage) -> None:

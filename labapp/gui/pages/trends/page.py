@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QPixmap
 from PySide6.QtWidgets import QCheckBox, QGridLayout, QSplitter
 
 from labapp.gui.dialogs import EVERYTHING, ask_file
 from labapp.gui.pages.page import Page
-from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, TrendOptions, TrendsState, show
+from labapp.gui.pages.trends.presenter import SIGNALS, TrendOptions, TrendsState, first_shown, show
 from labapp.gui.tasks import Control
 from labapp.gui.views.plots import PlotStack
 from labapp.gui.widgets.buttons import button, check_box
@@ -74,6 +74,10 @@ class TrendsPage(Page):
             return
         self._in_view = frame
         seen = self.workspace.overview()
+        if self.options.shown is None and seen is not None:
+            for key, box in self._boxes.items():
+                with QSignalBlocker(box):  # the operator has not chosen them
+                    box.setChecked(key in first_shown(seen))
         self.shown = shown = show(session, self.options, seen, self._events)
         self.plots.show_curves(shown.curves, shown.axis)
         self._mark(frame)
@@ -228,7 +232,6 @@ class TrendsPage(Page):
         names |= {key: name for key, (name, _) in SIGNALS.items()}
         for number, (key, name) in enumerate(names.items()):
             box = QCheckBox(name)
-            box.setChecked(key in FIRST_SHOWN or key in SIGNALS)
             box.setToolTip(f"Show {name.lower() if name != 'ARE' else name} over the recording")
             box.toggled.connect(lambda _: self._chosen())
             self._boxes[key] = box

@@ -44,7 +44,8 @@ MARKS = (
 )
 MEASURED, CORRECTED, DOUBTFUL, STALE = range(4)
 
-FIRST_SHOWN = ("width_mm", "length_mm", "height_mm", "are_mm")
+NO_HEIGHT_MM = 0.0005
+"""Heights and depths below it are displayed as zero."""
 
 NO_STATES = f"The pool's states are read from {FEWEST} frames or more, measured without a gap."
 
@@ -60,8 +61,8 @@ SIGNALS = {
 class TrendOptions:
     """Options chosen by the operator."""
 
-    shown: tuple[str, ...] = (*FIRST_SHOWN, *SIGNALS)
-    """Displayed measures and channels of `SIGNALS`."""
+    shown: tuple[str, ...] | None = None
+    """Displayed measures and channels of `SIGNALS`; None: those of `first_shown`."""
     without_doubtful: bool = False
     """Whether statistics and spectrum exclude doubtful frames."""
     spectrum_of: str = ""
@@ -92,6 +93,15 @@ class TrendsState:
     """Text about current and voltage."""
 
 
+def first_shown(seen: Overview) -> tuple[str, ...]:
+    """Keys displayed at first; the depth in place of a height that is zero in all frames."""
+    height, depth = (
+        (np.abs(seen.measures[key]) >= NO_HEIGHT_MM).any() for key in ("height_mm", "depth_mm")
+    )
+    size = "depth_mm" if depth and not height else "height_mm"
+    return ("width_mm", "length_mm", size, "are_mm", *SIGNALS)
+
+
 def show(
     session: Session,
     options: TrendOptions,
@@ -108,14 +118,15 @@ def show(
         Last determined events by measure and signal, s.
     """
     seen, signals = seen or session.overview(), session.signals
+    chosen = first_shown(seen) if options.shown is None else options.shown
     if session.has_lines:
-        return _show_lines(session, options, seen)
+        return _show_lines(session, chosen, seen)
     doubtful = outlying_frames(seen)
 
     def course_of(key: str) -> Trend:
         return trend(seen, key, options.without_doubtful, doubtful)
 
-    courses = [course_of(key) for key in BY_KEY if key in options.shown]
+    courses = [course_of(key) for key in BY_KEY if key in chosen]
     timed, axis, places = _axis(seen)
     curves = [
         _curve(course, events.get(course.quantity.key, ()))
@@ -123,7 +134,7 @@ def show(
         if len(course.frame)
     ]
     if signals is not None and timed:
-        curves += _signal_curves(signals, seen, options.shown, events)
+        curves += _signal_curves(signals, seen, chosen, events)
     of = course_of(options.spectrum_of) if options.spectrum_of in BY_KEY else None
     found, spectrum_axis, message = _spectrum(of, timed)
     return TrendsState(
@@ -149,7 +160,7 @@ def _axis(seen: Overview) -> tuple[bool, Axis, dict[int, float]]:
     return timed, axis, dict(zip(seen.frame.tolist(), at.tolist(), strict=True))
 
 
-def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> TrendsState:
+def _show_lines(session: Session, chosen: Sequence[str], seen: Overview) -> TrendsState:
     """Data of a line pattern over the recording; no choice of measures, no spectrum."""
     found = line_trend(session)
     timed, axis, places = _axis(seen)
@@ -172,7 +183,7 @@ def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> Tren
         if name in found.values and (known := np.isfinite(values := found.values[name])).any()
     ]
     if session.signals is not None and timed:
-        curves += _signal_curves(session.signals, seen, options.shown, {})
+        curves += _signal_curves(session.signals, seen, chosen, {})
     states = ", ".join(
         f"{state} {first}–{last}" if last > first else f"{state} {first}"
         for state, first, last in found.stretches()
