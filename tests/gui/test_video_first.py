@@ -206,6 +206,25 @@ def test_missing_recent_setup_is_reported_beside_the_button(
     assert "complete set-up" in window.page.answer.text()
 
 
+def test_last_setup_asked_for_twice_is_used_once(
+    window: MainWindow, hand: CountingHand, bench: Path, copy_sample: CopySample
+):
+    window.files.open(copy_sample("gtaw"))
+    hand.drop(bench / "recording")
+    hand.settle()
+    window.files.begin_draft(bench / "recording")
+    hand.settle()
+    session = window.workspace.session
+    assert session is not None
+    assert session.setup_problems
+    window.setups.use_last()
+    window.setups.use_last()
+    hand.settle()
+    assert not session.setup_problems
+    window.workspace.undo()
+    assert session.setup_problems
+
+
 def test_setup_for_another_frame_size_is_used_without_measuring(
     window: MainWindow,
     hand: CountingHand,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from PySide6.QtWidgets import QWidget
 
     from labapp.gui.preferences import PreferencesStore
-    from labapp.gui.tasks import Control
+    from labapp.gui.tasks import Control, Task
     from labapp.gui.workspace import Workspace
     from labapp.session.session import Session
 
@@ -39,6 +39,7 @@ class Setups(QObject):
         self._window = window
         self.workspace = workspace
         self.preferences = preferences
+        self._looking: Task | None = None
 
     def load(self) -> None:
         """Ask for a setup file and use it."""
@@ -55,7 +56,7 @@ class Setups(QObject):
     def use_last(self) -> None:
         """Use the set-up of the last opened session with a complete one."""
         session = self.workspace.session
-        if session is None:
+        if session is None or self._looking in self.workspace.tasks.active:
             return
         paths = [Path(name) for name in self.preferences.current.recent]
         others = [path for path in paths if path != session.path]
@@ -66,7 +67,7 @@ class Setups(QObject):
                 raise ValueError(NO_LAST)
             return found
 
-        self.workspace.tasks.start(
+        self._looking = self.workspace.tasks.start(
             "Looking for the last set-up",
             look,
             self._use_session,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -42,6 +43,7 @@ from labapp.simulation.render import Look, render
 from labapp.text import SETUP_MARKS
 from tests.gui.conftest import KEPT
 from tests.mirrors import FlatMirror
+from tests.waiting import PATIENCE_S
 
 SETUP = Path(__file__).parents[3] / "sample_sessions" / "gtaw" / "setup.toml"
 
@@ -289,6 +291,40 @@ def test_rejection_is_shown_beside_the_button(
     assert page.answer.text()
     assert page.checked is None
     assert not page.use_button.isEnabled()
+
+
+def test_work_pressed_twice_runs_once(
+    qtbot: QtBot, page: BenchCheckPage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free, runs = threading.Event(), []
+
+    def wait(chosen: object, *_: object) -> None:
+        runs.append(chosen)
+        free.wait(PATIENCE_S)
+        raise CannotMeasure("no-dots", "no dots")
+
+    monkeypatch.setattr(presenter, "check", wait)
+    monkeypatch.setattr(presenter, "predicted", wait)
+    shape = page.session.recording
+    assert shape is not None
+    add(qtbot, page, tmp_path, np.zeros((shape.rows, shape.columns), np.uint8))
+    for pressed in (page.check_button, page.predict_button):
+        runs.clear()
+        pressed.click()
+        pressed.click()
+        qtbot.waitUntil(lambda: len(runs) > 0)
+        assert len(page.workspace.tasks.active) == 1
+        free.set()
+        qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+        free.clear()
+    page.check_button.click()
+    former = page.workspace.tasks.active[0]
+    page.kind.edited.emit("cap")
+    page.check_button.click()  # with another mirror
+    assert former.control.cancelled.is_set()
+    assert len(page.workspace.tasks.active) == 2
+    free.set()
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
 
 
 @pytest.mark.slow
