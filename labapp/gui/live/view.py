@@ -26,12 +26,12 @@ from labapp.gui.live.live import SIMULATED, Live, choices, setup_of
 from labapp.gui.live.penetration import LivePenetration
 from labapp.gui.live.plan_fields import PlanFields
 from labapp.gui.live.record_bar import RecordBar
-from labapp.gui.tasks import DONE, Control, Task
+from labapp.gui.tasks import DONE, PROBLEM, Control, Task
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.exposure import ExposureBars
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import Message
+from labapp.gui.widgets.labels import Message, allow
 from labapp.gui.widgets.layouts import Group, hbox, vbox
 from labapp.gui.workspace import Workspace
 from labapp.media.cameras import (
@@ -63,6 +63,11 @@ STATUS_S = 0.2
 
 RING, RING_PX = "#2fd39b", 15
 """Rings around detected dots: a colour of the dots page; diameter in points of the screen."""
+
+
+START = "Show live what the camera sees"
+
+NO_LINES = "The simulated camera shows dots, and this session is of lines: choose another camera"
 
 
 class LiveView(QObject):
@@ -111,6 +116,7 @@ class LiveView(QObject):
         self._make_group()
         self.bar = RecordBar(self.trigger, self.mark, self.stop)
         workspace.changed.connect(self._set_limits)
+        workspace.changed.connect(self._show_state)
         workspace.closing.connect(self._session_closes)
         workspace.tasks.changed.connect(self._show_state)
         self._show_state()
@@ -142,6 +148,10 @@ class LiveView(QObject):
         session = self.workspace.session
         if session is None or self.live is not None:
             return
+        if why := self._why_not():
+            self.answer.setText(f"{PROBLEM} {why}")
+            self.workspace.notified.emit(why, True)
+            return
         chosen = self.camera.value()
         name = dict(self._choices)[chosen]
         folder, stem = self.workspace.folder, session.path.stem
@@ -172,6 +182,12 @@ class LiveView(QObject):
         self.live = live
         self._show_state()
         self.changed.emit()
+
+    def _why_not(self) -> str:
+        """Reason why the chosen camera cannot be started here; empty if it can."""
+        session = self.workspace.session
+        is_simulated = self.camera.value() == SIMULATED
+        return NO_LINES if is_simulated and session is not None and session.has_lines else ""
 
     def _opener(self, chosen: str, session: Session) -> Callable[[Control], Callable[[], Camera]]:
         """Function that makes the opener of a camera; the pool is rendered only the first time."""
@@ -414,7 +430,9 @@ class LiveView(QObject):
         self.camera.setEnabled(live is None)
         for each in (self.start_button, self.find_button):
             each.setVisible(live is None)
-        self.start_button.setEnabled(self.workspace.session is not None and not self._ending)
+        allow(self.start_button, START, self._why_not())
+        if self.workspace.session is None or self._ending:
+            self.start_button.setEnabled(False)
         self.settings.setVisible(runs)
         self.bar.setVisible(runs)
         self.plan_fields.set_enabled(not recording)
@@ -429,8 +447,9 @@ class LiveView(QObject):
             self._choices,
             tooltip="Which camera to watch; the simulated one films a pool on this bench",
         )
+        self.camera.edited.connect(lambda _: self._show_state())
         form.add(self.camera)
-        self.start_button = button("Start", "Show live what the camera sees", self.start)
+        self.start_button = button("Start", START, self.start)
         self.find_button = button("Find cameras", "List the cameras that are connected", self.find)
         self.answer, self.counts = Message(2), Message(2)
         self.figures, self.penetration = LiveFigures(), LivePenetration(self.workspace, self._watch)

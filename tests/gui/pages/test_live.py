@@ -403,10 +403,21 @@ def test_lines_are_not_judged_as_dots(
     with open_source(recording) as video:
         image = video.frame(0).image
     window.workspace.attempt(lambda session: session.set_setup(setup))
-    camera = SimulatedDevice("pool", lambda _: image, rate_hz=20)
-    monkeypatch.setattr(live_view, "pool_camera", lambda *_: camera)
-    start(page, qtbot)
     view = page.live_view
+    assert not view.start_button.isEnabled()  # the simulated camera films dots
+    view.start()
+    assert view.live is None
+    assert view.start_button.toolTip() in view.answer.text()
+    camera = SimulatedDevice("lines", lambda _: image, rate_hz=20)
+    monkeypatch.setattr(live_view, "open_camera", lambda _: camera.open())
+    monkeypatch.setattr(
+        live_view, "find_cameras", lambda: ([CameraInfo("test:0", "Lines", "USB")], [])
+    )
+    view.find()
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    view.camera.set_value("test:0")
+    view.camera.edited.emit("test:0")
+    start(page, qtbot)
     qtbot.waitUntil(lambda: view.live.room_byte is not None and view.updates > 20)
     assert page.exposure.isHidden()
     assert not len(view._rings.data)
