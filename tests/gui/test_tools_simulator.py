@@ -128,7 +128,9 @@ def test_invalid_input_is_reported_and_nothing_written(
     qtbot.waitUntil(lambda: "pool.shape" in simulator.picture.accessibleDescription())
     assert not simulator.start_button.isEnabled()
     assert simulator.table.rows == ()
+    simulator.say("Stopped")
     choose(simulator, "cap", qtbot)
+    assert not simulator.message.text()
     folder = tmp_path / "folder"
     folder.mkdir()
     (folder / "mine.txt").write_text("mine")

@@ -121,6 +121,13 @@ def test_study_is_created_and_run_and_a_recording_opened(
     assert study.isVisible()
     assert study.list.selectedItems()
     assert study.open_button.isEnabled()
+    page = study.study.folder / "summary.html"
+    page.unlink()
+    click(study.page_button)
+    assert str(page) in study.message.text()
+    qtbot.waitUntil(lambda: is_idle(study))
+    click(study.start_button)
+    qtbot.waitUntil(lambda: page.exists() and is_idle(study), timeout=4 * PATIENCE_MS)
 
 
 def test_dropped_files_are_opened_or_filled_in(

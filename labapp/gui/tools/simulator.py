@@ -117,6 +117,8 @@ class SimulatorWindow(ToolWindow):
 
     def show_scenario(self) -> None:
         """Draw the chosen scenario, and show its seed and number of frames."""
+        if not self.working:
+            self.say("")  # the last message is about the former one
         if self.folder.value() == self._proposed:
             self._propose(Path(self._proposed).parent)
         self._draw(None)

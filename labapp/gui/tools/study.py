@@ -329,7 +329,10 @@ class StudyWindow(ToolWindow):
         """Show the summary in the browser."""
         if self.study is not None:
             page = self.study.folder / "summary.html"
-            if not QDesktopServices.openUrl(QUrl.fromLocalFile(str(page))):
+            if not page.exists():
+                self.say(f"{page} is no longer there: Run writes it again", True)
+                self.start_button.setFocus()
+            elif not QDesktopServices.openUrl(QUrl.fromLocalFile(str(page))):
                 self.say(f"The summary is {page}")
 
     # --- running -------------------------------------------------------------------------------
