@@ -113,7 +113,8 @@ def open_window(
     former = {number: signal.signal(number, lambda *_: window.close()) for number in stops}
     window.show()
     first_use = FirstUse(window.workspace.tasks, window)
-    target = partial(_load_what_is_needed, first_use.found.emit)
+    closed = threading.Event()
+    target = partial(_load_what_is_needed, first_use.found.emit, closed.is_set)
     loading = threading.Thread(target=target, name="loading", daemon=True)
     load = QTimer(window, singleShot=True)
     load.timeout.connect(loading.start)
@@ -127,6 +128,7 @@ def open_window(
     try:
         yield window
     finally:
+        closed.set()
         load.stop()
         heartbeat.stop()
         gc.enable()
@@ -171,12 +173,16 @@ class FirstUse(QObject):
         )
 
 
-def _load_what_is_needed(not_compiled: Callable[[list[str]], object]) -> None:
+def _load_what_is_needed(
+    not_compiled: Callable[[list[str]], object], is_closed: Callable[[], bool]
+) -> None:
     """Load the modules needed later while the operator looks at the first page."""
     if modules := compiling.not_compiled():
         not_compiled(modules)
     with contextlib.suppress(ImportError):  # 3-D drawing may not be installed
         for name in NEEDED_LATER:
+            if is_closed():
+                return
             importlib.import_module(name)
 
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
+
+from labapp.gui import app, compiling
 
 FOR_LATER = {
     *("scipy", "cv2", "av", "pyqtgraph", "matplotlib", "pyvista", "vtkmodules"),
@@ -112,3 +117,12 @@ def test_sigterm_closes_the_window(tmp_path: Path):
 def test_widgets_are_deleted_in_the_main_thread_only(tmp_path: Path):
     """A widget that a worker thread deletes can deadlock with the window."""
     assert words_of(GARBAGE, tmp_path / "preferences.json") == {"none", "MainThread"}
+
+
+def test_closed_app_loads_no_more_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[str] = []
+    monkeypatch.setattr(app, "NEEDED_LATER", ("first", "second", "third"))
+    monkeypatch.setattr(importlib, "import_module", loaded.append)
+    monkeypatch.setattr(compiling, "not_compiled", list)
+    app._load_what_is_needed(lambda _: None, lambda: len(loaded) == 2)
+    assert loaded == ["first", "second"]

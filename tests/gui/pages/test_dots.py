@@ -14,14 +14,16 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QHBoxLayout, QToolButton, QWidget
 from pytestqt.qtbot import QtBot
 
+from labapp.core.images.find_dots import DotSettings
 from labapp.core.pipeline import start_correction
 from labapp.core.rows.correction import Correction, add_dot, delete_dots, shift_row
+from labapp.core.rows.find_lattice import LatticeSettings
 from labapp.errors import InputError
 from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.fitting import Processes, Refit
 from labapp.gui.pages.dots.page import DotsPage
 from labapp.gui.shell.window import MainWindow
-from labapp.gui.tasks import Control
+from labapp.gui.tasks import Cancelled, Control
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT, let_draw
@@ -726,3 +728,11 @@ def test_frame_without_dots_shows_the_reason(
     assert origin(page) == "measured"
     assert presenter.NO_DOTS in page.dots_panel.seen.text()
     assert result.measurement.reason[1:] in page.dots_panel.seen.text()
+
+
+def test_cancelled_detection_looks_for_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    control = Control()
+    monkeypatch.setattr(presenter, "find_dots", lambda *_: control.cancelled.set())
+    monkeypatch.setattr(presenter, "find_lattice", lambda *_: pytest.fail("it goes on"))
+    with pytest.raises(Cancelled):
+        presenter.detect(np.zeros((8, 8)), 0, (DotSettings(), LatticeSettings()), control)

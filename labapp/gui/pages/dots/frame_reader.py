@@ -100,7 +100,7 @@ class FrameReader(QObject):
             self.ready.emit()
 
         self._task = self._space.tasks.start(
-            "Looking for dots", lambda _: presenter.detect(image, frame, by), done
+            "Looking for dots", lambda control: presenter.detect(image, frame, by, control), done
         )
 
 

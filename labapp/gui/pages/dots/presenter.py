@@ -134,13 +134,16 @@ def _automatic(result: Result, by: tuple[DotSettings, LatticeSettings]) -> bool:
     return same and measurement.correction is None
 
 
-def detect(image: Image, frame: int, by: tuple[DotSettings, LatticeSettings]) -> DetectedDots:
+def detect(
+    image: Image, frame: int, by: tuple[DotSettings, LatticeSettings], control: Control
+) -> DetectedDots:
     """Detect dots and rows in a frame without measuring it."""
     dots: Dots | None = None
     lattice: Lattice | None = None
     why = ""
     try:
         dots = find_dots(image, by[0])
+        control.check()
         lattice = find_lattice(dots, (image.shape[0], image.shape[1]), by[1])
     except CannotMeasure as answer:
         why = answer.reason
