@@ -12,6 +12,8 @@ import pytest
 
 from labapp.gui import app, compiling
 
+pytestmark = pytest.mark.usefixtures("state")  # the user's drafts load more modules
+
 FOR_LATER = {
     *("scipy", "cv2", "av", "pyqtgraph", "matplotlib", "pyvista", "vtkmodules"),
     *("h5py", "tifffile", "pywt", "reportlab", "labapp.core.pipeline", "labapp.session.session"),
