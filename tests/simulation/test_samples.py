@@ -273,19 +273,20 @@ def test_frame_with_raised_torch_is_measured():
 
 @pytest.mark.parametrize("index", [2, 4, 5])
 @pytest.mark.slow
-def test_blocked_frame_is_measured_with_a_given_reference(index):
+def test_blocked_frame_is_measured_alone_and_with_given_rows(index):
     sample, frame = blocked_rows(), blocked_rows().frame(index)
-    result = measured(sample, index)
+    found = measured(sample, index)
     status, reference, _, blocked = advised(index)
-    assert result.status == status == "ambiguous-rows"
-    correction = set_reference(start_correction(result), reference)
+    assert found.status == status == "ok"
+    assert found.lattice.reference == reference
+    correction = set_reference(start_correction(found), reference)
     for row in blocked:
         correction = block_row(correction, row)
-    result = measured(sample, index, correction)
-    assert result.status == "ok"
-    assert result.measures.height_mm == pytest.approx(frame.pool.size.height_mm, rel=0.02)
-    true = frame.reflections.plane_mm[tuple(result.match.ray.T - 1)]
-    np.testing.assert_allclose(result.match.plane_mm, true, atol=0.3)
+    for result in (found, measured(sample, index, correction)):
+        assert result.status == "ok"
+        assert result.measures.height_mm == pytest.approx(frame.pool.size.height_mm, rel=0.02)
+        true = frame.reflections.plane_mm[tuple(result.match.ray.T - 1)]
+        np.testing.assert_allclose(result.match.plane_mm, true, atol=0.3)
 
 
 @pytest.mark.parametrize("mark", [True, False])
