@@ -221,13 +221,13 @@ def evaluate(
             del known[next(iter(known))]
         known[key] = _evaluated(observed, labels, fit_settings, initial)
     found: Hypothesis | None = known[key]
-    return found and replace(found)  # hypotheses are told apart by identity
+    return found and replace(found)  # a copy, as `repair` compares hypotheses with `is`
 
 
 def _evaluated(
     observed: Observation, labels: IntArray, fit_settings: FitSettings, initial: FittedPool | None
 ) -> Hypothesis | None:
-    """`evaluate` without results of before."""
+    """Fit and evaluate as `evaluate`, without looking at the kept results."""
     pool = try_fit(observed, labels, initial=initial)
     if pool is None:
         return None
