@@ -84,6 +84,35 @@ def test_likeliest_setup_is_reached_in_several_steps(kind: str, seed: int) -> No
     assert got.status == "ambiguous-rows"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "seed"), [("dented", 6702), ("cap", 6745), ("egg", 6741)])
+def test_setup_wrong_within_its_uncertainty_does_not_prevent_a_match(kind: str, seed: int) -> None:
+    """If the set-up is taken as exact, no surface explains the dots."""
+    rig, seen, pool = draw(kind, seed, 0.05, 12)
+    wrong_rig = with_setup_errors(rig, seed, 1.0)
+    got = measure_pool(pool, seen, wrong_rig)
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.95 * got.shown
+    exact = measure_pool(pool, seen, replace(wrong_rig, uncertainty=None))
+    assert exact.status == "no-match"
+
+
+@pytest.mark.slow
+def test_rows_found_with_another_setup_must_be_clearer() -> None:
+    """Wrong rows cost less than the right ones by 28 units of χ², twice the usual margin."""
+    rig, seen, pool = draw("lowrear", 6755, 0.05, 12)
+    got = measure_pool(pool, seen, with_setup_errors(rig, 6755, 1.0))
+    assert got.status == "ambiguous-rows"
+
+
+@pytest.mark.slow
+def test_rival_is_not_discarded_before_its_labels_are_grown() -> None:
+    """The right rows cost more than the wrong ones at first, and less when they were grown."""
+    rig, seen, pool = draw("concave", 6902, 0.05, 12)
+    got = measure_pool(pool, seen, with_setup_errors(rig, 6902, 2.0))
+    assert got.status == "ambiguous-rows"
+
+
 @pytest.mark.parametrize(("kind", "seed"), [("cap", 5014), ("ellipse", 5011)])
 def test_rows_that_fit_the_entered_setup_are_preferred(kind: str, seed: int) -> None:
     """Other rows fit nearly as well, but only with another set-up."""

@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -40,7 +41,7 @@ from labapp.core.matching.decision import (
     decide,
     supported,
 )
-from labapp.core.matching.free_setup import FreeHypothesis
+from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open, with_setup_free
 from labapp.core.matching.hypothesis import (
     USUAL_FIT,
     Hypothesis,
@@ -84,6 +85,14 @@ MOST_SITES = 8
 
 MOST_REPAIRED = 4
 """Maximum number of hypotheses from caps that are repaired if none explains the frame."""
+
+MOST_SETUPS = 3
+"""Maximum number of set-ups tried if that as entered explains no hypothesis: the likeliest for the
+labels, and for those grown with the previous one."""
+
+DOUBTFUL_SHARE = 1 / 3
+"""Share of a difference in cost that counts if labels were found with another set-up than that as
+entered: of 120 such frames, wrong labels led in two, by 20 and 28 units of χ²."""
 
 
 def match_rays(
@@ -146,8 +155,7 @@ def match_rays(
             raise
         decided = None
     if decided is None or (decided[1] and not any_explains(observed, found)):
-        found = found + _by_caps(observed)
-        decided = _decide_among(observed, found, lattice, settings, MOST_SCATTERED_AT_LAST)
+        decided = _decide_at_last(observed, found + _by_caps(observed), lattice, settings)
     best, open_holes = decided
     match = match_of_hypothesis(observed, best, best.orientation(observed))
     if open_holes:
@@ -198,6 +206,63 @@ def _decide_among(
     if not wider:
         return best, open_holes
     return decide(observed, found + wider, settings, most_scattered)
+
+
+def _decide_at_last(
+    observed: Observation,
+    found: list[Hypothesis],
+    lattice: Lattice | None,
+    settings: MatchSettings,
+) -> tuple[Hypothesis, list[FreeHypothesis]]:
+    """Decide among hypotheses of every kind, with another set-up if that as entered explains none.
+
+    Errors are those of `match_rays`.
+    """
+    try:
+        return _decide_among(observed, found, lattice, settings, MOST_SCATTERED_AT_LAST)
+    except CannotMeasure as refusal:
+        if refusal.status != "no-match" or not found:
+            raise
+        decided = _decide_with_other_setup(observed, found, lattice, settings)
+        if decided is None:
+            raise
+        return decided
+
+
+def _decide_with_other_setup(
+    observed: Observation,
+    found: list[Hypothesis],
+    lattice: Lattice | None,
+    settings: MatchSettings,
+) -> tuple[Hypothesis, list[FreeHypothesis]] | None:
+    """Decide with the likeliest set-up if that as entered is in doubt; None if it does not help.
+
+    A set-up that is wrong within its uncertainty can leave many dots without a ray. Labels are
+    grown, repaired and compared with the likeliest set-up for the cheapest hypothesis, then
+    compared with shifted ones, each with its own. The surface is fitted with the set-up as entered,
+    as for other frames.
+    """
+    best, likelier = min(found, key=lambda hypothesis: hypothesis.cost), observed
+    for _ in range(MOST_SETUPS):
+        free = with_setup_free(observed, best, USUAL_FIT)
+        moved = free.with_exact_setup
+        start = None if moved is None else grow_and_evaluate(moved, free.labels)
+        if moved is None or start is None:
+            return None
+        likelier, found = moved, with_repaired(moved, [], [start])
+        best = min(found, key=lambda hypothesis: hypothesis.cost)
+        if any(suffices(likelier, each) for each in found):
+            break
+    try:
+        best, rivals = _decide_among(likelier, found, lattice, settings, MOST_SCATTERED_AT_LAST)
+    except CannotMeasure:
+        return None
+    entered = evaluate(observed, best.labels)
+    if entered is None:
+        return None
+    holes = holes_left_open(observed, entered, USUAL_FIT, settings.margin / DOUBTFUL_SHARE)
+    best = replace(entered, witness=best.witness, missed_rays=best.missed_rays)
+    return best, [replace(each, cost=DOUBTFUL_SHARE * each.cost) for each in holes or rivals]
 
 
 def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import scipy
 
-from labapp.core.matching.free_setup import with_setup_free
+from labapp.core.matching.free_setup import SETUP_GAIN, with_setup_free
 from labapp.core.matching.hypothesis import KNOT_ERROR_MM, USUAL_FIT, Hypothesis
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation
@@ -25,11 +25,6 @@ CONTRADICTED_BITS = 0.5
 """Mean −log₂ likelihood of the rays near the boundary above which the surface is rejected: less
 than 0.3 even if the set-up is slightly wrong, more than 1 if the labels are wrong for that reason.
 """
-
-SETUP_GAIN = 80.0
-"""If another set-up (`with_setup_free`) lowers the cost of a rejected hypothesis by more, the given
-one is in doubt. With the true one, cluttered frames gained less than 40; with errors of one
-standard uncertainty, most gained hundreds."""
 
 NOTHING_EXPLAINS = "no surface explains the reflected dots"
 """Reason for ``no-match`` if most of the dots have no ray."""
@@ -115,7 +110,7 @@ def refuse_unexplained(
 def _doubt_of_setup(observed: Observation, best: Hypothesis) -> str:
     """Return the end of the reason for a rejection that another set-up would avoid, or nothing."""
     freed = with_setup_free(observed, best, USUAL_FIT)
-    if freed.cost > best.cost - SETUP_GAIN:
+    if freed.gain <= SETUP_GAIN:
         return ""
     count = np.sum(freed.labels != UNLABELLED)
     explained = f"{count} of {len(observed.plane_mm)} dots would have a ray"
