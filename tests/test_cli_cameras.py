@@ -110,7 +110,7 @@ def test_impossible_recordings_are_rejected(tmp_path: Path, labapp: Run) -> None
     out = tmp_path / "run.nut"
     (tmp_path / "there.nut").write_text("mine")
     for arguments, expected in (
-        (("webcam", "--out", out), "webcam: camera: webcam; expected uvc:NUMBER"),
+        (("webcam", "--out", out), f"webcam: camera: webcam; expected {KINDS[0].form} or "),
         (("uvc:77", "--out", out), "uvc:77: camera: uvc:77 is not connected; expected a camera"),
         ((CAMERA,), "either --out or --session"),
         ((CAMERA, "--out", out, "--session", out), "either --out or --session"),

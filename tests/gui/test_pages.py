@@ -95,9 +95,11 @@ def test_added_page_appears_everywhere(tmp_path: Path):
         f"{len(STEPS)} {STEPS[-1].title}",
         f"{len(STEPS) + 1} The toy",
     ]
-    assert report["keys"] == ["Ctrl+0", True]  # the toy is the tenth step
+    number = len(STEPS) + 1
+    has_key = number <= 10
+    assert report["keys"] == [f"Ctrl+{number % 10}" if has_key else "", True]
     assert report["enabled"]
-    assert report["told"]
+    assert report["told"] == has_key
     assert report["in view"] == ["toy", True, "The toy"]
     assert report["panel"][:2] == ["The toy", "Play with the toy."]
     assert report["panel"][2].endswith("30 frames")
