@@ -99,9 +99,10 @@ def test_setup_wrong_within_its_uncertainty_does_not_prevent_a_match(kind: str, 
 
 @pytest.mark.slow
 def test_rows_found_with_another_setup_must_be_clearer() -> None:
-    """Wrong rows cost less than the right ones by 28 units of χ², twice the usual margin."""
-    rig, seen, pool = draw("lowrear", 6755, 0.05, 12)
-    got = measure_pool(pool, seen, with_setup_errors(rig, 6755, 1.0))
+    """Wrong rows cost less than the right ones by 48 units of χ², three times the usual margin."""
+    clutter = clutter_recordings.Clutter(missing=0.05, false=10)
+    rig, scenes = clutter_recordings.draw("dented", 51001, 3, clutter)
+    got = clutter_recordings.measured(scenes[2], with_setup_errors(rig, 51001, 1.0))
     assert got.status == "ambiguous-rows"
 
 
