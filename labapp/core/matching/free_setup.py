@@ -70,7 +70,7 @@ class FreeHypothesis:
     gain: float = 0.0
 
     @property
-    def with_exact_setup(self) -> Observation | None:
+    def with_likelier_setup(self) -> Observation | None:
         """The dots with that set-up taken as exact; None if the one as entered is not in doubt."""
         if self.observed is None or self.gain <= SETUP_GAIN:
             return None

@@ -10,7 +10,8 @@
    dots, predict the dot of every ray, label the dots with an unambiguous ray, and fit again until
    nothing changes. This labels the dots that the lattice left in doubt and removes wrong labels.
    Swapped, skipped and omitted rows are repaired (`repair`).
-3. The cheapest hypothesis is accepted if no other is close (`decision`).
+3. The cheapest hypothesis is accepted if no other is close (`decision`). If it leaves too much
+   unexplained and the set-up is in doubt, labels are found with the likeliest set-up.
 """
 
 from __future__ import annotations
@@ -246,7 +247,7 @@ def _decide_with_other_setup(
     best, likelier = min(found, key=lambda hypothesis: hypothesis.cost), observed
     for _ in range(MOST_SETUPS):
         free = with_setup_free(observed, best, USUAL_FIT)
-        moved = free.with_exact_setup
+        moved = free.with_likelier_setup
         start = None if moved is None else grow_and_evaluate(moved, free.labels)
         if moved is None or start is None:
             return None
