@@ -57,6 +57,7 @@ def test_mirroring_twice_restores_the_plane(setup: Path) -> None:
         (["--point", "0", "60", "0", "--normal", "0", "1", "1"], "--point"),
         (["--point", "0", "-30", "0", "--normal", "0", "1", "0.02"], "--normal"),
         ([*MIRROR, "--tilt-sigma", "-1"], "--tilt-sigma"),
+        ([*MIRROR, "--tilt-sigma", "45"], "pitch_deg_sigma"),
     ],
 )
 def test_impossible_mirror_is_rejected(setup: Path, given: list[str], option: str) -> None:
@@ -65,3 +66,12 @@ def test_impossible_mirror_is_rejected(setup: Path, given: list[str], option: st
     assert result.exit_code != 0
     assert option in (result.output + str(result.exception))
     assert setup.read_text("utf-8") == before
+
+
+@pytest.mark.parametrize("length", ["1e-300", "1e300"])
+def test_normal_may_have_any_length(setup: Path, length: str) -> None:
+    def pose(normal: list[str]) -> str:
+        mirror = [*MIRROR[:4], "--normal", *normal]
+        return CliRunner().invoke(app, ["calibrate", "fold", "--setup", str(setup), *mirror]).output
+
+    assert pose(["0", length, length]) == pose(["0", "1", "1"])

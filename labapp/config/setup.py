@@ -169,24 +169,33 @@ def parse_setup(text: str, path: str | os.PathLike[str], lines: bool = False) ->
     return Setup(rig, calibration, text, values["bench_check"]["date"] if checked else "")
 
 
-def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]) -> None:
+def update_setup(
+    path: str | os.PathLike[str],
+    values: Mapping[str, Mapping[str, object]],
+    *,
+    complete: bool = False,
+) -> None:
     """Set keys of a setup file; everything else, including comments, is left unchanged.
 
-    The file and missing sections are created. Values are not checked: read the file back to find
-    what is still missing or wrong.
+    The file and missing sections are created.
 
     Parameters
     ----------
     values
         Section → key → value; None removes the key.
+    complete
+        Whether the changed set-up must be valid. Otherwise it is not checked: read the file back to
+        find what is still missing or wrong.
 
     Raises
     ------
     InputError
-        If the file exists and is not TOML, or cannot be written.
+        If the file exists and is not TOML, cannot be written, or would not be valid.
     """
     path = Path(path)
     text = updated_setup(read_text(path, A_SETUP) if path.exists() else "", path, values)
+    if complete:
+        parse_setup(text_with_rays(text, path, parse_toml(text, path, A_SETUP)), path)
     with os_errors_as_input(path, "file", "a file that can be written"):
         if path.exists() and not os.access(path, os.W_OK):
             raise PermissionError(13, "write-protected")

@@ -74,7 +74,7 @@ def calibrate_fold(
         sigmas = {
             f"{name}_sigma": round(float(one), 9) for name, one in zip(POSE, sigma, strict=True)
         }
-        update_setup(setup, {"imaging_plane": values | sigmas})
+        update_setup(setup, {"imaging_plane": values | sigmas}, complete=True)
         typer.echo(f"They are the imaging plane of {setup.absolute()}")
 
 

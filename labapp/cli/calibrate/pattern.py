@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from labapp.cli.calibrate.bench import mirror_picture
-from labapp.cli.shared import NOTHING_MEASURED, warned
+from labapp.cli.shared import NOTHING_MEASURED, check_target, warned
 from labapp.errors import InputError
 from labapp.files import write_file
 
@@ -51,6 +51,7 @@ def calibrate_pattern(
 
     known = warned(read_setup(setup))
     _check_options(setup, pictures, height, out, use)
+    check_target(out, ".csv")
     try:
         found = calibrated(
             [mirror_picture(path, Plate(z)) for path, z in zip(pictures, height, strict=True)],
@@ -75,7 +76,7 @@ def calibrate_pattern(
     if use:
         left = dict.fromkeys(("rays", "absent", "rotation_deg"))
         values = {"kind": MEASURED, "file": out.name, **left}
-        update_setup(setup, {"pattern": values})
+        update_setup(setup, {"pattern": values}, complete=True)
         typer.echo(f"They are the pattern of {setup.absolute()}")
 
 

@@ -33,9 +33,15 @@ class FoldingMirror(ReadOnlyArrays):
     point_mm: FloatArray
     normal: FloatArray
 
+    @property
+    def unit_normal(self) -> FloatArray:
+        """Normal of length 1, shape (3,)."""
+        largest_1 = self.normal / np.abs(self.normal).max()  # tiny or huge squares are 0 or inf
+        return np.asarray(largest_1 / np.linalg.norm(largest_1))
+
     def image_of(self, plane: ImagingPlane) -> ImagingPlane:
         """Mirror image of a plane, as it appears from the pool."""
-        unit = self.normal / np.linalg.norm(self.normal)
+        unit = self.unit_normal
         turn = np.eye(3) - 2.0 * np.outer(unit, unit)
         origin = self.point_mm + turn @ (plane.origin_mm - self.point_mm)
         return replace(
@@ -44,7 +50,7 @@ class FoldingMirror(ReadOnlyArrays):
 
     def moved(self, offset_mm: float, tilt_deg: tuple[float, float]) -> FoldingMirror:
         """Return the mirror shifted along its normal and tilted about two axes in its surface."""
-        unit = self.normal / np.linalg.norm(self.normal)
+        unit = self.unit_normal
         first = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
         first /= np.linalg.norm(first)
         tilt = np.tan(np.radians(tilt_deg))
