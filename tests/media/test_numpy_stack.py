@@ -103,6 +103,20 @@ def test_wrong_arrays_of_an_archive_are_rejected(
         open_source(path)
 
 
+def test_archive_with_two_arrays_of_a_name_is_rejected(tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    np.savez(path, frames=GREY)
+    with zipfile.ZipFile(path) as archive:
+        content = archive.read("frames.npy")
+    with (
+        zipfile.ZipFile(path, "a") as archive,
+        pytest.warns(UserWarning, match="Duplicate name"),
+    ):
+        archive.writestr("frames.npy", content)
+    with pytest.raises(InputError, match="arrays: frames twice"):
+        open_source(path)
+
+
 @pytest.mark.parametrize("write", [np.savez, np.savez_compressed])
 def test_wrong_checksum_is_rejected(tmp_path: Path, write: object) -> None:
     """Only the checksum in the directory of the archive is changed."""

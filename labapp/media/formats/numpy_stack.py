@@ -170,11 +170,13 @@ def _from_archive(
             archive = zipfile.ZipFile(file)
         except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
             raise InputError(path, "content", error, A_NPZ) from error
-        members = {
-            entry.filename.removesuffix(".npy"): entry
-            for entry in archive.infolist()
-            if entry.filename.endswith(".npy")
-        }
+        members: dict[str, zipfile.ZipInfo] = {}
+        for entry in archive.infolist():
+            name = entry.filename.removesuffix(".npy")
+            if name in members:
+                raise InputError(path, "arrays", f"{name} twice", A_NPZ)
+            if name != entry.filename:
+                members[name] = entry
         for entry in members.values():
             if entry.compress_type not in AS_NUMPY_DOES:
                 raise InputError(path, entry.filename, "packed by another program", A_DEFLATED)
