@@ -76,10 +76,18 @@ def test_result_folder_and_session_have_equal_dynamics(gtaw: Path, tmp_path: Pat
     measures = tmp_path / "results" / "measures.csv"
     head, first, *others = measures.read_text("utf-8").splitlines()
     frame, time_s, rest = first.split(",", 2)
+    width = rest.split(",")[head.split(",")[2:].index("width_mm")]
+
+    def with_width(cell: str) -> str:
+        return rest.replace(f",{width},", f",{cell},", 1)
+
     for column, wrong in (
         ("frame", f"nan,{time_s},{rest}"),
         ("time_s", f"{frame},1e300,{rest}"),
         ("time_s", f"{frame},inf,{rest}"),
+        ("width_mm", f"{frame},{time_s},{with_width('inf')}"),
+        ("width_mm", f"{frame},{time_s},{with_width('nan')}"),
+        ("width_mm", f"{frame},{time_s},{with_width('1_0')}"),
     ):
         measures.write_text("\n".join([head, wrong, *others]), "utf-8")
         with pytest.raises(InputError, match=column):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from labapp.config.csv_tables import bounded_lines, open_table
+from labapp.config.csv_tables import bounded_lines, open_table, parse_number
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import CloughTocherSurface
 from labapp.core.surface.measures import SHAPES, SIZES
@@ -78,10 +78,11 @@ def _rows(path: Path) -> Iterator[dict[str, str]]:
 
 
 def _number(path: Path, row: dict[str, str], name: str) -> float:
-    try:
-        return float(row[name]) if row[name] else np.nan
-    except (KeyError, ValueError) as error:
-        raise InputError(path, name, row.get(name, "missing"), "a number") from error
+    cell = row.get(name)
+    value = np.nan if cell == "" else parse_number(cell or "", ",")
+    if value is None:
+        raise InputError(path, name, "missing" if cell is None else cell, "a number")
+    return value
 
 
 def _points(path: Path, rows: list[dict[str, str]]) -> FloatArray:
