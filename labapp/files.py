@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from labapp.errors import os_errors_as_input
+from filelock import FileLock, Timeout
+
+from labapp.errors import InputError, os_errors_as_input
 
 
 def as_bytes(text: str) -> bytes:
@@ -46,14 +49,19 @@ def atomic_file(path: Path) -> Iterator[Path]:
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a temporary file and rename it to ``path``, so that readers never see a partial file.
 
-    Permissions of an existing file are preserved, and links are followed, not replaced.
+    Permissions of an existing file are preserved, and links are followed, not replaced. A device or
+    a pipe (``/dev/stdout``, ``/dev/null``) is written to, not replaced.
 
     Raises
     ------
     OSError
         If it cannot be written; an existing file is unchanged and no temporary file remains.
     """
-    path = path.resolve()
+    if path.exists() and not path.is_file():
+        with path.open("wb", buffering=0) as device:
+            write_all(device, content)
+        return
+    path = Path(os.path.realpath(path))  # `resolve` raises RuntimeError for a loop of links
     with atomic_file(path) as part:
         with part.open("wb") as file:
             file.write(content)
@@ -61,6 +69,64 @@ def write_atomically(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         if path.exists():
             shutil.copymode(path, part)
+
+
+def write_all(file: io.FileIO, content: bytes) -> None:
+    """Write all of ``content``; partial writes are continued, so that a full disk raises."""
+    while content:
+        content = content[file.write(content) :]
+
+
+def read_limited(path: Path, largest: int, wanted: str) -> bytes:
+    """Read a file of at most ``largest`` bytes; a device or a pipe cannot fill the memory.
+
+    Parameters
+    ----------
+    wanted
+        Expected content, for the errors.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or is larger.
+    """
+    with os_errors_as_input(path, "file", wanted), path.open("rb") as file:
+        content = file.read(largest + 1)
+    if len(content) > largest:
+        raise InputError(path, "size", f"more than {largest} bytes", f"{wanted}, at most {largest}")
+    return content
+
+
+@contextmanager
+def only_writer(target: Path) -> Iterator[bool]:
+    """Exclude other programs from writing to a file or folder, by a lock file beside it.
+
+    Yields whether it is locked: some network drives do not support locks.
+
+    Raises
+    ------
+    InputError
+        If another program has locked it.
+    """
+    path = target.with_name(f".{target.name}.lock")
+    lock = FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise InputError(
+            target, "folder", "is being written by another program", "to wait for it"
+        ) from error
+    except (OSError, NotImplementedError):
+        pass
+    try:
+        yield lock.is_locked
+    finally:
+        if lock.is_locked:
+            # Before the release, so that the next writer creates a new file. Windows deletes it at
+            # the release.
+            with suppress(OSError):
+                path.unlink()
+            lock.release()
 
 
 def write_file(path: Path, content: bytes) -> Path:

@@ -243,15 +243,15 @@ def test_full_disk_leaves_complete_frames(
     measured_images: list[np.ndarray],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    append = results._append
+    append = results.write_all
 
-    def append_until_full(file: object, text: str) -> None:
+    def append_until_full(file: object, content: bytes) -> None:
         if len(measured_images) == 3:
-            append(file, text[:10])
+            append(file, content[:10])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        append(file, text)
+        append(file, content)
 
-    monkeypatch.setattr(results, "_append", append_until_full)
+    monkeypatch.setattr(results, "write_all", append_until_full)
     out = tmp_path / "out"
     code, _, stderr = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
     assert code == 2

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from unittest import mock
 
 import pytest
 
-from labapp.files import atomic_file, write_atomically
+from labapp.errors import InputError
+from labapp.files import atomic_file, only_writer, read_limited, write_all, write_atomically
+from labapp.system import IS_WINDOWS
 
 
 def test_link_beside_the_file_is_not_followed(tmp_path: Path):
@@ -49,3 +52,58 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path):
         part.write_text("half")
         raise RuntimeError
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("a", "old")]
+
+
+@pytest.mark.skipif(IS_WINDOWS, reason="no pipes in folders")
+def test_pipe_is_written_to_and_not_replaced(tmp_path: Path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_atomically(pipe, b"rows")
+        assert os.read(reader, 10) == b"rows"
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
+
+
+def test_folder_is_not_replaced(tmp_path: Path):
+    with pytest.raises(OSError):  # noqa: PT011
+        write_atomically(tmp_path, b"rows")
+    assert tmp_path.is_dir()
+
+
+def test_loop_of_links_is_replaced_rather_than_a_fault(tmp_path: Path):
+    (tmp_path / "loop").symlink_to("loop")
+    write_atomically(tmp_path / "loop", b"rows")
+    assert (tmp_path / "loop").read_bytes() == b"rows"
+
+
+def test_only_the_permitted_size_is_read(tmp_path: Path):
+    path = tmp_path / "a"
+    path.write_bytes(b"12345")
+    assert read_limited(path, 5, "digits") == b"12345"
+    with pytest.raises(InputError, match="size: more than 4 bytes; expected digits"):
+        read_limited(path, 4, "digits")
+    with pytest.raises(InputError, match=r"file: .*; expected digits"):
+        read_limited(tmp_path / "none", 4, "digits")
+
+
+def test_second_writer_is_rejected_until_the_first_is_done(tmp_path: Path):
+    target = tmp_path / "out"
+    with only_writer(target):
+        with pytest.raises(InputError, match="another program"), only_writer(target):
+            pass
+        assert [path.name for path in tmp_path.iterdir()] == [".out.lock"]
+    with only_writer(target) as locked:
+        assert locked
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_partial_write_is_continued():
+    file = mock.Mock()
+    written: list[bytes] = []
+    file.write = lambda content: written.append(content[:3]) or len(content[:3])
+    write_all(file, "0,1,µm\n".encode())
+    assert b"".join(written) == "0,1,µm\n".encode()

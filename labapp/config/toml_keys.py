@@ -14,9 +14,13 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from labapp.errors import InputError
+from labapp.files import read_limited
 
 LARGEST_MM = 10_000.0
 """Lengths above this are taken for an error in the unit."""
+
+LARGEST_TEXT = 1 << 24
+"""Largest TOML file, bytes."""
 
 LARGEST = 1e9
 """Upper limit of numbers of any kind."""
@@ -28,12 +32,10 @@ def read_text(path: Path, wanted: str) -> str:
     Raises
     ------
     InputError
-        If the file cannot be read or is not text.
+        If the file cannot be read, is larger than `LARGEST_TEXT` or is not text.
     """
     try:
-        return path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, wanted) from error
+        return read_limited(path, LARGEST_TEXT, wanted).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(path, "encoding", "not UTF-8", wanted) from error
 

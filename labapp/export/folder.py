@@ -12,11 +12,9 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-
-from filelock import FileLock, Timeout
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.errors import InputError
@@ -43,7 +41,7 @@ from labapp.export.rendering.studio import PICTURE_PX, drawing_errors, drawing_p
 from labapp.export.results import SURFACES, surface_files
 from labapp.export.summary import Summary
 from labapp.export.tables import TABLES, csv_header, csv_rows, frame_tables
-from labapp.files import as_bytes, beside
+from labapp.files import as_bytes, beside, only_writer
 from labapp.media import GreyImage
 from labapp.system import sync_folder
 from labapp.text import SIGMA_OF, now
@@ -209,7 +207,7 @@ def export(
     InputError
         If the folder has other contents or cannot be written, or a picture cannot be drawn.
     """
-    target = Path(folder).resolve()
+    target = Path(os.path.realpath(folder))
     if not target.name:
         raise InputError(target, "folder", "is the root of the disk", OWN_FOLDER)
     if "frames" in choice.pictures and image_of is None:
@@ -376,7 +374,9 @@ def _draw_trend(path: Path, summary: Summary) -> None:
 def _beside(target: Path) -> Iterator[Path]:
     """Yield a temporary folder, which replaces the target unless the block raises."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    with _alone(target):
+    with only_writer(target) as locked:
+        if locked:
+            _tidy(target)
         _check_replaceable(target)
         part = beside(target)
         part.mkdir()
@@ -387,32 +387,6 @@ def _beside(target: Path) -> Iterator[Path]:
             _swap(part, target, part.with_suffix(OLD))
         finally:
             shutil.rmtree(part, ignore_errors=True)
-
-
-@contextmanager
-def _alone(target: Path) -> Iterator[None]:
-    """Lock the target against a second export, and clean up after a killed one."""
-    path = target.with_name(f".{target.name}.lock")
-    lock = FileLock(path)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout as error:
-        raise InputError(
-            target, "export", "is being written by another program", "to wait for it"
-        ) from error
-    except (OSError, NotImplementedError):
-        pass  # some network drives do not support locks
-    try:
-        if lock.is_locked:
-            _tidy(target)
-        yield
-    finally:
-        if lock.is_locked:
-            # Before the release, so that the next export creates a new file. Windows deletes it
-            # at the release.
-            with suppress(OSError):
-                path.unlink()
-            lock.release()
 
 
 def _tidy(target: Path) -> None:

@@ -21,10 +21,10 @@ from labapp.core.dynamics.static_maps import MOST_POINTS, GaussianMap, LinearMap
 from labapp.core.dynamics.weld_series import LONGEST_MEMORY, MOST_HELD, Orders, WeldSeries
 from labapp.core.surface.measures import WITH_SIGMA, sigma_name
 from labapp.core.values import FloatArray
-from labapp.errors import InputError, os_errors_as_input
+from labapp.errors import InputError
 from labapp.export.features import needs_extra, weld_series
 from labapp.export.frame_result import FrameResult
-from labapp.files import as_bytes, write_file
+from labapp.files import as_bytes, read_limited, write_file
 from labapp.text import csv_text, number_cell
 from labapp.version import VERSION
 
@@ -85,13 +85,8 @@ def read_model(path: str | os.PathLike[str]) -> PenetrationModel:
         If it is not a model, or anything in it is invalid.
     """
     path = Path(path)
-    with os_errors_as_input(path, "file", WANTED):
-        size = path.stat().st_size
-        if size > LARGEST:
-            raise InputError(path, "size", f"{size} bytes", f"at most {LARGEST} bytes")
-        content = path.read_bytes()
     try:
-        read = json.loads(content)
+        read = json.loads(read_limited(path, LARGEST, WANTED))
         if read["program"] != "labapp" or read["format"] != FORMAT:
             raise InputError(path, "format", read["format"], f"{FORMAT}, of this labapp")
         return _model(read)
@@ -105,15 +100,15 @@ def _model(read: Mapping[str, Any]) -> PenetrationModel:
     """Return the model described by a file's content; raises `ValueError` and others."""
     orders = Orders(*(_whole(read["orders"], name) for name in ("poles", "lags", "delay")))
     features = tuple(map(str, read["features"]))
-    constants = tuple(map(float, read["time_constants_s"]))
-    full = read["full_mm"]
-    step_s = float(read["step_s"])
+    constants = tuple(_number(one, "time constants") for one in read["time_constants_s"])
+    full = None if read["full_mm"] is None else _number(read["full_mm"], "full_mm")
+    step_s = _number(read["step_s"], "step_s")
     _check(0 < len(set(features)) == len(features) and set(features) <= set(WITH_SIGMA), "features")
     _check(1e-4 <= step_s <= 100 and len(constants) == orders.poles <= 2, "step or poles")
     _check(all(0 < one <= 1000 for one in constants), "time constants")
     memory = 8 * sum(constants) / step_s + orders.delay + orders.lags
     _check(orders.lags >= 1 and memory <= LONGEST_MEMORY, "orders")
-    _check(full is None or 0 < float(full) < 1e6, "full_mm")
+    _check(full is None or 0 < full < 1e6, "full_mm")
     target = str(read["target"])
     _check(target.replace("_", "").isalnum() and len(target) <= 50, "target")
     width = orders.lags * len(features)
@@ -128,19 +123,17 @@ def _model(read: Mapping[str, Any]) -> PenetrationModel:
         count = len(given["values"])
         _check(0 < count <= MOST_POINTS, "points")
         values, variances = (_array(given[key], count) for key in ("values", "variances"))
-        lengths, signal = _array(given["lengths"], width), float(given["signal"])
+        lengths, signal = _array(given["lengths"], width), _number(given["signal"], "kernel")
         static = GaussianMap(
             _array(given["points"], count, width), values, variances, lengths, signal
         )
         _check(bool((variances > 0).all() and (lengths > 0).all() and 0 < signal < 1e12), "kernel")
         _check(bool(np.isfinite(static.weights).all()), "kernel")
     center, scale, low, high = (_array(read[key], width) for key in ARRAYS)
-    mean, *others = (float(read[key]) for key in NUMBERS)
+    mean, *others = (_number(read[key], key) for key in NUMBERS)
     _check(bool((scale > 0).all()), "scale")
     _check(all(0 <= one < 1e12 for one in (mean, *others)), "numbers")
-    settings = ModelSettings(
-        features, target, step_s, orders, None if full is None else float(full)
-    )
+    settings = ModelSettings(features, target, step_s, orders, full)
     return PenetrationModel(
         read["kind"], settings, constants, center, scale, low, high, mean, static, *others
     )
@@ -157,10 +150,16 @@ def _whole(of: Mapping[str, Any], name: str) -> int:
     return int(value)
 
 
+def _number(value: Any, name: str) -> float:
+    _check(type(value) in (int, float), name)  # not true, nor "1"
+    return float(value)
+
+
 def _array(values: Any, *shape: int) -> FloatArray:
-    found = np.array(values, float)
-    _check(found.shape == shape and bool((np.abs(found) < 1e12).all()), "shape or number")
-    return found
+    found = np.array(values)
+    _check(found.shape == shape and found.dtype.kind in "if", "shape or number")
+    _check(bool((np.abs(found) < 1e12).all()), "number")
+    return found.astype(float)
 
 
 # --- predictions --------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import json
 import os
 import re
 from collections.abc import Collection, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import Self
@@ -20,7 +21,7 @@ from labapp.export.formats import SURFACE_FORMATS
 from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SPACING_MM, known_nodes, open_mesh, solid_mesh
 from labapp.export.tables import TABLES, csv_header, sigma_of, table_rows
-from labapp.files import as_bytes, write_atomically
+from labapp.files import as_bytes, only_writer, write_all, write_atomically
 from labapp.text import now, unescaped_csv_text
 from labapp.version import VERSION
 
@@ -120,16 +121,20 @@ class ResultsWriter:
             **provenance,
         }
         self._files: dict[str, io.FileIO] = {}
+        self._lock = ExitStack()
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            self._lock.enter_context(only_writer(Path(os.path.realpath(folder))))
             _clear(folder)
             self._write_run()
             for name in TABLES:
                 self._files[name] = io.FileIO(folder / f"{name}.csv", "a")
-                _append(self._files[name], csv_header(name, sigma_parts))
-        except OSError as error:
+                write_all(self._files[name], as_bytes(csv_header(name, sigma_parts)))
+        except BaseException as error:
             self._close_files()
-            raise self._unwritable(error) from error
+            if isinstance(error, OSError):
+                raise self._unwritable(error) from error
+            raise
 
     def write(self, result: FrameResult) -> None:
         """Write all results of one frame.
@@ -152,7 +157,7 @@ class ResultsWriter:
             for path, content in surfaces.items():
                 write_atomically(path, content)
             for name, text in rows.items():
-                _append(self._files[name], text)
+                write_all(self._files[name], as_bytes(text))
             if not self._run["sigma_of"] and (covered := sigma_of(result.measurement)):
                 self._run["sigma_of"] = covered
                 self._write_run()
@@ -209,8 +214,10 @@ class ResultsWriter:
             "frames_done": self.frames,
         }
         try:
-            self._close_files()
-            self._write_run()
+            try:
+                self._write_run()
+            finally:
+                self._close_files()
         except OSError as failure:
             if error is None:
                 raise self._unwritable(failure) from failure
@@ -222,6 +229,7 @@ class ResultsWriter:
     def _close_files(self) -> None:
         for file in self._files.values():
             file.close()
+        self._lock.close()
 
     def _unwritable(self, error: OSError) -> InputError:
         plural = "previous frame is" if self.frames == 1 else f"{self.frames} previous frames are"
@@ -256,10 +264,3 @@ def _is_run(path: Path) -> bool:
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(run, dict) and run.get("program") == "labapp"
-
-
-def _append(file: io.FileIO, text: str) -> None:
-    """Append text; partial writes are continued, so that a full disk raises."""
-    content = as_bytes(text)
-    while content:
-        content = content[file.write(content) :]

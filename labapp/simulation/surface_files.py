@@ -15,12 +15,16 @@ from scipy.interpolate import CloughTocher2DInterpolator
 
 from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
+from labapp.files import read_limited
 from labapp.simulation.outlined_pool import OutlinedPool, pool_from_heights
 
 A_SURFACE = "a height map (.csv, .npy, .npz) or a mesh (.stl, .ply)"
 
 MESH_NODES = 250
 """Maximum number of nodes along the longer side of the grid at which a mesh is sampled."""
+
+LARGEST_FILE = 1 << 29
+"""Largest table or mesh, bytes."""
 
 SMALLEST_MM, LARGEST_MM = 0.5, 200.0
 """Limits of the longer side of a pool; other values indicate a wrong unit."""
@@ -134,7 +138,7 @@ def _npz(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
 
 
 def _csv(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
-    text = path.read_text("utf-8-sig")
+    text = read_limited(path, LARGEST_FILE, A_SURFACE).decode("utf-8-sig")
     header, _, rest = text.partition("\n")
     if header.strip().replace(" ", "") != "x_mm,y_mm,z_mm":
         return _even(_numbers(text), spacing_mm), None
@@ -175,7 +179,7 @@ def _rising(line: FloatArray, name: str) -> FloatArray:
 def _mesh(path: Path, spacing_mm: float | None) -> tuple[Grid, FloatArray]:
     """Sample a mesh on an even grid, and find its boundary."""
     del spacing_mm
-    data = path.read_bytes()
+    data = read_limited(path, LARGEST_FILE, A_SURFACE)
     corners = _stl(data) if path.suffix.lower() == ".stl" else _ply(data)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     up = normal[:, 2] > 0.05 * np.linalg.norm(normal, axis=1)

@@ -182,6 +182,12 @@ def changed(key: str, value: Any) -> Callable[[dict[str, Any]], object]:
         changed("static/lengths", [0.0] * 6),
         changed("static/signal", -1.0),
         changed("static/signal", "much"),
+        changed("static/signal", "1.5"),
+        changed("mean_mm", True),
+        changed("rmse_mm", "0.1"),
+        changed("step_s", True),
+        changed("scale", ["1"] * 6),
+        changed("scale", [True] * 6),
     ],
 )
 def test_damaged_model_is_rejected(damage: Callable[[Any], object], tmp_path: Path) -> None:

@@ -232,6 +232,20 @@ def test_only_files_of_a_former_run_are_replaced(
     assert [row["frame"] for row in table(written / "measures.csv")] == ["3"]
 
 
+def test_two_runs_do_not_mix_in_a_folder(out: Path, writer: Writer, measured: Measurement) -> None:
+    with writer(out) as files:
+        files.write(FrameResult(0, 0.0, measured))
+        before = {path.name: path.read_bytes() for path in out.iterdir()}
+        with pytest.raises(InputError, match="another program"):
+            writer(out)
+        assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+        files.write(FrameResult(1, 0.1, measured))
+    assert len(table(out / "measures.csv")) == 2
+    with writer(out):
+        pass
+    assert table(out / "measures.csv") == []
+
+
 @pytest.mark.parametrize("run", [None, "{}", "not json"])
 def test_other_files_are_not_replaced(out: Path, writer: Writer, run: str | None) -> None:
     out.mkdir(parents=True)
@@ -292,7 +306,7 @@ def test_failed_frame_leaves_no_rows(
     out: Path, writer: Writer, measured: Measurement, failure: BaseException, at: int
 ) -> None:
     """Each of the six files of a frame fails in turn, half written."""
-    write, append = results.write_atomically, results._append
+    write, append = results.write_atomically, results.write_all
     calls = iter(range(100))
 
     def fail_whole(path: Path, content: bytes) -> None:
@@ -300,11 +314,11 @@ def test_failed_frame_leaves_no_rows(
         if next(calls) == at:
             raise failure
 
-    def fail_append(file: object, text: str) -> None:
+    def fail_append(file: object, content: bytes) -> None:
         if next(calls) == at:
-            append(file, text[: len(text) // 2])
+            append(file, content[: len(content) // 2])
             raise failure
-        append(file, text)
+        append(file, content)
 
     expected = InputError if isinstance(failure, OSError) else type(failure)
     with pytest.raises(expected), writer(out) as files:  # noqa: PT012 - the frame before counts
@@ -312,7 +326,7 @@ def test_failed_frame_leaves_no_rows(
         before = {path: path.read_bytes() for path in out.iterdir()}
         with (
             mock.patch.object(results, "write_atomically", fail_whole),
-            mock.patch.object(results, "_append", fail_append),
+            mock.patch.object(results, "write_all", fail_append),
         ):
             files.write(FrameResult(1, 0.1, measured))
     after = {path: path.read_bytes() for path in out.iterdir()}
@@ -321,14 +335,6 @@ def test_failed_frame_leaves_no_rows(
     assert after == before
     assert run["frames_done"] == 1
     assert run["state"] == ("interrupted" if expected is KeyboardInterrupt else "failed")
-
-
-def test_partial_write_is_continued() -> None:
-    file = mock.Mock()
-    written: list[bytes] = []
-    file.write = lambda content: written.append(content[:3]) or len(content[:3])
-    results._append(file, "0,1,µm\n")
-    assert b"".join(written) == "0,1,µm\n".encode()
 
 
 FULL_DISK = """
