@@ -564,14 +564,27 @@ def test_detect_rejects_a_size_for_a_detector_without_one(labapp: Run, tmp_path:
     assert "--size" in stderr
 
 
-def test_detect_does_not_overwrite_its_image(labapp: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["frame.png", "run.labsession", "setup.toml", "mine"])
+def test_detect_does_not_overwrite_other_files(labapp: Run, tmp_path: Path, name: str) -> None:
     image = tmp_path / "frame.png"
     cv2.imwrite(str(image), np.full((40, 40), 90, np.uint8))
-    before = image.read_bytes()
-    code, _, stderr = labapp("detect", image, "--out", tmp_path / "." / "frame.png")
+    target = tmp_path / name
+    if target != image:
+        target.write_text("mine")
+    before = target.read_bytes()
+    code, _, stderr = labapp("detect", image, "--out", tmp_path / "." / name)
     assert code == 2
-    assert "--out: the image itself; expected another file" in stderr
-    assert image.read_bytes() == before
+    assert f"{name}: --out: " in stderr
+    assert target.read_bytes() == before
+
+
+def test_image_with_the_suffix_of_a_table_is_not_overwritten(labapp: Run, tmp_path: Path) -> None:
+    image = tmp_path / "frame.csv"
+    image.write_bytes(cv2.imencode(".png", np.full((40, 40), 90, np.uint8))[1].tobytes())
+    before = image.read_bytes()
+    code, _, stderr = labapp("detect", image, "--out", image)
+    assert (code, image.read_bytes()) == (2, before)
+    assert "--out: " in stderr
 
 
 def test_algorithm_without_irs_is_rejected(labapp: Run, folder: Path, tmp_path: Path) -> None:

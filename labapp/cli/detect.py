@@ -13,6 +13,7 @@ from labapp.cli.shared import (
     ROWS_HELP,
     DetectorName,
     RowsName,
+    check_target,
 )
 from labapp.errors import InputError
 
@@ -51,9 +52,8 @@ def detect(
     if size is not None and detector != "band-pass":
         raise InputError("--size", "size", size, "--detector band-pass, which alone has it")
     how = DotSettings(detector, BandPassSettings(size_px=size)), LatticeSettings(rows)
+    check_target(out, ".csv", inputs=[image])
     dots, lattice, doubt = detect_dots(image, *how)
-    if out.exists() and out.samefile(image):
-        raise InputError(out, "--out", "the image itself", "another file, for the dots (CSV)")
     write_detected(out, dots, lattice)
     if doubt:
         typer.echo(f"{image}: {doubt}", err=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from labapp.cli.shared import Commands, progress_shown
+from labapp.cli.shared import Commands, check_target, progress_shown
 from labapp.errors import InputError
 from labapp.files import as_bytes, write_file
 from labapp.system import quoted
@@ -38,6 +38,7 @@ def simulate(
     from labapp.export.features import FeatureTable
     from labapp.simulation.penetration import FEATURES, TARGET, simulate_welds
 
+    check_target(out, ".csv", ".mat")
     made = tuple(one.series for one in simulate_welds(welds, seed))
     FeatureTable(FEATURES, TARGET, made).write(out)
     typer.echo(f"{pluralize(welds, 'weld')}, in {out.absolute()}")
@@ -64,6 +65,7 @@ def table(
     from labapp.run.study.sections import study_features
     from labapp.run.study.study import Study
 
+    check_target(out, ".csv", ".mat", inputs=[study, sections])
     opened = Study(study, results)
     found, unused = study_features(opened.plan, opened.tables(), sections)
     found.write(out)
@@ -113,6 +115,9 @@ def fit(
     from labapp.export.features import FeatureTable
     from labapp.export.penetration import write_model
 
+    check_target(out, ".json")
+    if left_out is not None:
+        check_target(left_out, ".csv", inputs=[features])
     read = FeatureTable.read(features)
     if not read.target:
         raise InputError(features, "columns", "no penetration", "one, such as back_width_mm")
@@ -177,6 +182,7 @@ def predict(
     from labapp.core.dynamics.weld_series import find_transitions
     from labapp.export.penetration import prediction_csv, read_model
 
+    check_target(out, ".csv", inputs=[source])
     chosen = read_model(model)
     found: dict[str, Prediction] = {}
     for one in _series_of(source, chosen.settings.features):
@@ -234,6 +240,7 @@ def onnx(
     """Write a model as ONNX: from feature means of the last steps to penetration, without ±."""
     from labapp.export.penetration import read_model, write_onnx
 
+    check_target(out, ".onnx")
     read = read_model(model)
     write_onnx(out, read)
     names = ", ".join(read.settings.features)

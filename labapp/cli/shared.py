@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
@@ -294,6 +295,31 @@ def _results(results: Collection[tuple[int, str]]) -> str:
     return f"{pluralize(len(results), 'result')} ({frames_text(frames)})"
 
 
+def check_target(out: Path, *suffixes: str, inputs: Collection[Path] = ()) -> None:
+    """Refuse to overwrite a file of another kind, or an input, with results.
+
+    Parameters
+    ----------
+    suffixes
+        Suffixes of files that may be replaced.
+    inputs
+        Files that the command reads.
+
+    Raises
+    ------
+    InputError
+        If there is such a file; devices and pipes are written to.
+    """
+    if not out.is_file():
+        return
+    kinds = " or ".join(suffixes)
+    expected = f"a new file, or an earlier result to replace ({kinds})"
+    if any(path.exists() and out.samefile(path) for path in inputs):
+        raise InputError(out, "--out", "is an input of the command", expected)
+    if out.suffix.lower() not in suffixes:
+        raise InputError(out, "--out", "is there already, and of another kind", expected)
+
+
 def results_folder(out: Path | None, tables: bool = True) -> Path | None:
     """Return the folder for tables and pictures, created if missing; None if ``out`` is None.
 
@@ -319,8 +345,8 @@ def writable_folder(folder: Path, option: str = "--out") -> Path:
     """
     with os_errors_as_input(folder, option, "a folder that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / ".write").touch()
-        (folder / ".write").unlink()
+        with TemporaryFile(dir=folder):
+            pass
     return folder
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING_MEASURED, warned
+from labapp.cli.shared import NOTHING_MEASURED, check_target, warned
 from labapp.errors import InputError
 from labapp.files import write_file
 from labapp.text import csv_text
@@ -70,6 +70,8 @@ def calibrate_bench(
     if predict:
         _print_forecast(known.rig, mirrors)
         return
+    if out is not None:
+        check_target(out, ".csv")
     check = _checked(setup, known, pictures or [], mirrors, free or [])
     _print_check(check)
     if out is not None:
