@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import io
 import json
 import os
 import re
@@ -245,7 +246,7 @@ def test_full_disk_leaves_complete_frames(
 ) -> None:
     append = results.write_all
 
-    def append_until_full(file: object, content: bytes) -> None:
+    def append_until_full(file: io.FileIO, content: bytes) -> None:
         if len(measured_images) == 3:
             append(file, content[:10])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

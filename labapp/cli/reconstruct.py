@@ -200,10 +200,14 @@ def _measure_recording(
             with results, ExitStack() as at_end:
                 measurer: Measurer = ColdMeasurer(source.frame, setup, settings)
                 if warm:
-                    processes = at_end.enter_context(stretch_pools(len(selected)))
                     measurer = RecordingMeasurer(
-                        *(source_path, source.index, setup, settings, surfaces, sigma_parts),
-                        processes,
+                        source_path,
+                        source.index,
+                        setup,
+                        settings,
+                        with_surfaces=surfaces,
+                        sigma_parts=sigma_parts,
+                        pools=at_end.enter_context(stretch_pools(len(selected))),
                     )
                 sinks = [results.write, summary.add, *more_sinks, shown]
                 for _ in run(selected, with_setup_check(measurer, record), sinks):

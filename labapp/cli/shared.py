@@ -58,7 +58,7 @@ RECORDING_HELP = (
 )
 FRAMES_HELP = (
     "Frames A up to but not including B, from 0, every STEP-th; parts may be omitted. "
-    "A alone: that frame."
+    "A alone: that frame. Negative: counted from the end."
 )
 
 Warm = Annotated[

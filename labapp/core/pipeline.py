@@ -215,7 +215,7 @@ def measure(
     if (lines_rig := line_rig(bench.rig)) is not None:
         return _with_lines(result, image, lines_rig, bench), None
     rig, match_settings = bench.rig, replace(settings.match, correspondence=settings.correspondence)
-    frame_shape, known = (image.shape[0], image.shape[1]), None
+    frame_shape, previous = (image.shape[0], image.shape[1]), None
     tracked, tuning, initial = None, None, None
     try:
         if isinstance(correction, Correction):
@@ -231,7 +231,7 @@ def measure(
             on_step("dots")
             observed = Observation.of(dots, bench, frame_shape)
             tracked = track(prior, observed, settings.fit, match_settings)
-            match, known = tracked.match, prior.known()
+            match, previous = tracked.match, prior.known()
             lattice = lattice_of_match(match, rig, len(dots))
         else:
             dots, tuning = _dots_and_tuning(image, settings.dots)
@@ -247,7 +247,7 @@ def measure(
             return _by_scheme(result, match, rig, settings), None
         pool = tracked.pool if tracked else fit.fit_surface(match, rig, settings.fit, initial)
         on_step("surface")
-        reconstruction, measured = fit.bound_and_measure(match, pool, rig, settings.fit, known)
+        reconstruction, measured = fit.bound_and_measure(match, pool, rig, settings.fit, previous)
     except CannotMeasure as why:
         return _refused(result, why), None
     on_step("measures")

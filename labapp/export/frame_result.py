@@ -26,7 +26,8 @@ class FrameResult:
     rows
         Its rows of each table as CSV text (`tables.table_rows`); None: not computed yet.
     residuals
-        Its residuals, if these were removed from the measurement.
+        Residuals of its dots, for the check of the set-up, if the measurement came from another
+        process without its reconstruction (`without_surface`).
     setup_doubt
         Why the set-up is doubtful according to the frames so far; empty if it is not.
     """

@@ -26,9 +26,11 @@ from labapp.text import now, unescaped_csv_text
 from labapp.version import VERSION
 
 RUN_FILE = "run.json"
-OURS = re.compile(
+RESULT_NAMES = re.compile(
     r"(measures|dots|points|boundary|penetration|surface_\d{6,})\.csv|surface_\d{6,}\.stl"
 )
+"""Names of the files of a run, besides `RUN_FILE`; the next run in the folder deletes them."""
+
 SURFACES = ("csv", "stl")
 """Formats of each surface in a run."""
 
@@ -87,6 +89,8 @@ class ResultsWriter:
         Pixel ↔ imaging plane, for the dots' positions on the plane.
     provenance
         Source, set-up and options, for `run.json`.
+    surfaces
+        Whether to write the surface of each frame, in the formats `SURFACES`.
     sigma_parts
         Whether `measures.csv` also has the parts of standard uncertainties.
 
@@ -246,7 +250,7 @@ def _clear(folder: Path) -> None:
     """Delete a former run's results, `measures.csv` first, so that no row is without its files."""
     if (folder / RUN_FILE).is_symlink():  # `write_atomically` would follow it
         raise InputError(folder, RUN_FILE, "is a link", "a folder whose files are its own")
-    ours = [path for path in folder.iterdir() if OURS.fullmatch(path.name)]
+    ours = [path for path in folder.iterdir() if RESULT_NAMES.fullmatch(path.name)]
     if ours and not _is_run(folder / RUN_FILE):
         raise InputError(
             folder,

@@ -84,8 +84,8 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("sigma_mm", f"standard uncertainty of the height, {HEIGHT_SIGMA_OF}"),
         Column("residual_x_mm", "captured minus computed dot on the imaging plane, along X′"),
         Column("residual_z_mm", "captured minus computed dot on the imaging plane, along Z′"),
-        Column("error_x_mm", "reflection error on the work piece, along X"),
-        Column("error_y_mm", "reflection error on the work piece, along Y"),
+        Column("error_x_mm", "that residual scaled to the work piece: reflection error, along X"),
+        Column("error_y_mm", "that residual scaled to the work piece: reflection error, along Y"),
     ),
     "boundary": (
         FRAME,

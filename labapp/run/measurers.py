@@ -19,7 +19,7 @@ from contextlib import AbstractContextManager, ExitStack, closing, contextmanage
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -37,8 +37,6 @@ from labapp.simulation.parallel import NICE, Here, held, hold, in_order, worker_
 
 if TYPE_CHECKING:
     from labapp.core.recording.chain import WarmChain
-
-T = TypeVar("T")
 
 AHEAD = 8
 """Number of frames submitted to a pool of processes beyond the one whose result is awaited."""

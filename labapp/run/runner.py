@@ -82,7 +82,7 @@ def select_frames(text: str, count: int, option: str = "--frames") -> range:
     try:
         first, *others = (int(part) if part.strip() else None for part in text.split(":"))
         if first is not None and not others:
-            others = [first + 1 or None]
+            others = [first + 1 or None]  # -1 is the last: up to the end, not up to 0
         selected = range(count)[slice(first, *others)]
     except (TypeError, ValueError) as error:  # TypeError: empty, or four numbers
         raise InputError(option, "frames", text, SOME_FRAMES) from error

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import subprocess
@@ -314,7 +315,7 @@ def test_failed_frame_leaves_no_rows(
         if next(calls) == at:
             raise failure
 
-    def fail_append(file: object, content: bytes) -> None:
+    def fail_append(file: io.FileIO, content: bytes) -> None:
         if next(calls) == at:
             append(file, content[: len(content) // 2])
             raise failure

@@ -14,8 +14,13 @@ import numpy.typing as npt
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 Image = npt.NDArray[np.generic]
+"""Grey levels of a frame, shape (height, width), of any real type."""
+
 Grey = npt.NDArray[np.float32]
+"""The same as 32-bit floats."""
+
 Picture = Grey | npt.NDArray[np.uint8]
+"""The same as the compiled loops accept it."""
 
 
 @dataclass(frozen=True, repr=False)
