@@ -588,6 +588,35 @@ def test_image_with_the_suffix_of_a_table_is_not_overwritten(labapp: Run, tmp_pa
     assert "--out: " in stderr
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("penetration simulate --out run.labsession", "--out"),
+        ("penetration table study.toml sections.csv --out sections.csv", "--out"),
+        ("penetration fit sections.csv --out sections.csv", "--out"),
+        ("penetration fit sections.csv --out new.json --left-out sections.csv", "--left-out"),
+        ("penetration predict model.json sections.csv --out sections.csv", "--out"),
+        ("penetration onnx model.json --out model.json", "--out"),
+        (f"calibrate bench a.png --mirror plate:0 --setup {SETUP} --out a.png", "--out"),
+        (
+            f"calibrate pattern a.png a.png --height 0 --height 1 --setup {SETUP} --out a.png",
+            "--out",
+        ),
+    ],
+)
+def test_other_files_are_not_overwritten_with_results(
+    labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, option: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("run.labsession", "study.toml", "sections.csv", "model.json", "a.png"):
+        (tmp_path / name).write_text("mine")
+    code, _, stderr = labapp(*command.split())
+    assert code == 2
+    assert f": {option}: is " in stderr
+    files = [path for path in tmp_path.iterdir() if path.is_file()]
+    assert [path.read_text() for path in files] == ["mine"] * 5
+
+
 def test_algorithm_without_irs_is_rejected(labapp: Run, folder: Path, tmp_path: Path) -> None:
     code, _, stderr = labapp(
         "reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o", "--algorithm", "epa-r"

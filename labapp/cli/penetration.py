@@ -117,7 +117,7 @@ def fit(
 
     check_target(out, ".json")
     if left_out is not None:
-        check_target(left_out, ".csv", inputs=[features])
+        check_target(left_out, ".csv", inputs=[features], option="--left-out")
     read = FeatureTable.read(features)
     if not read.target:
         raise InputError(features, "columns", "no penetration", "one, such as back_width_mm")

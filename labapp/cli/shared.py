@@ -295,7 +295,9 @@ def _results(results: Collection[tuple[int, str]]) -> str:
     return f"{pluralize(len(results), 'result')} ({frames_text(frames)})"
 
 
-def check_target(out: Path, *suffixes: str, inputs: Collection[Path] = ()) -> None:
+def check_target(
+    out: Path, *suffixes: str, inputs: Collection[Path] = (), option: str = "--out"
+) -> None:
     """Refuse to overwrite a file of another kind, or an input, with results.
 
     Parameters
@@ -304,6 +306,8 @@ def check_target(out: Path, *suffixes: str, inputs: Collection[Path] = ()) -> No
         Suffixes of files that may be replaced.
     inputs
         Files that the command reads.
+    option
+        The option that names ``out``.
 
     Raises
     ------
@@ -315,9 +319,9 @@ def check_target(out: Path, *suffixes: str, inputs: Collection[Path] = ()) -> No
     kinds = " or ".join(suffixes)
     expected = f"a new file, or an earlier result to replace ({kinds})"
     if any(path.exists() and out.samefile(path) for path in inputs):
-        raise InputError(out, "--out", "is an input of the command", expected)
+        raise InputError(out, option, "is an input of the command", expected)
     if out.suffix.lower() not in suffixes:
-        raise InputError(out, "--out", "is there already, and of another kind", expected)
+        raise InputError(out, option, "is there already, and of another kind", expected)
 
 
 def results_folder(out: Path | None, tables: bool = True) -> Path | None:
