@@ -200,7 +200,7 @@ class FootSwitches(QObject):
     @property
     def learns(self) -> bool:
         """Whether the app waits for a pedal to be learned."""
-        return self._learning is not None and self._learning in self._tasks.active
+        return self._learning in self._tasks.active
 
     def look(self) -> None:
         """Search for devices in the background."""

@@ -142,7 +142,8 @@ class Tasks(QObject):
             Called with its `Control`; touches no widget.
         on_done, on_part
             Called on the GUI thread with what ``work`` returns, and with each `Control.part`.
-            Not called after a cancel or a failure.
+            Not called after a failure, nor once the work has noticed a cancel. Work that completes
+            before it notices one has changed its session or files, and ``on_done`` says so.
         beside
             Also shows the reason of a failure at the pressed button; called with "" at the start.
         kind

@@ -15,9 +15,11 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import analysis_presenter
 from labapp.gui.tools.analysis import AnalysisWindow
+from labapp.gui.widgets.tables import CellTable
 from labapp.session.session import Session
 from labapp.studies import error_analysis, predicted_budget
 from labapp.studies.analysis import PARTS
+from labapp.studies.tables import Table
 from tests.conftest import Run
 from tests.gui.conftest import CopySample
 from tests.waiting import PATIENCE_S
@@ -249,3 +251,11 @@ def test_default_size_without_a_setup(copy_sample: CopySample, tmp_path: Path):
     with Session.open(copy_sample("thumb_tack")) as session:
         assert analysis_presenter.has_setup(session)
         assert analysis_presenter.expected_mm(session) == (9.75, 9.75, 0.91)
+
+
+def test_values_of_the_dissertation_are_headed_by_its_name(qtbot: QtBot):
+    shown = CellTable("Results")
+    qtbot.addWidget(shown)
+    shown.show_table(Table("errors", "", ("scheme", "text", "text_mean_pct"), (("fit", 1.0, 2.0),)))
+    headings = [shown.horizontalHeaderItem(column).text() for column in range(3)]
+    assert headings == ["scheme", "dissertation", "dissertation mean, %"]

@@ -19,6 +19,7 @@ import numpy as np
 from labapp.config.setup import Setup
 from labapp.core.images.band_pass import DetectorTuning, quick_dots
 from labapp.core.images.dots import Dots
+from labapp.core.images.exposure import Exposure, judge_exposure
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import UNMEASURED, Quality, judge_quality
@@ -80,8 +81,8 @@ class JudgedFrame:
 
     dots_px: FloatArray | None
     """(u, v) of its dots, shape (n, 2); None if they come with the shown frames."""
-    quality: Quality
-    """Whether it can be measured."""
+    quality: Quality | Exposure
+    """Whether it can be measured; only how bright it is, where lines are filmed."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +276,9 @@ class Live:
             self.room_byte = shutil.disk_usage(self._folder).free
         except OSError:
             self.room_byte = None
+        depth = None if self.feed is None else self.feed.bit_depth
         if self._dots is None:
+            self._judged.append(JudgedFrame(None, judge_exposure(frame.image, None, depth)))
             return
         quick = self._dots.method == "band-pass"
         now_s, known = time.monotonic(), self._light
@@ -284,7 +287,6 @@ class Live:
             self._light_s = now_s + LIGHT_S
         dots = _dots_in(frame.image, self._light, self._dots)
         found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
-        depth = None if self.feed is None else self.feed.bit_depth
         quality = judge_quality(frame.image, found, depth, rays_of(self.setup))
         places = None if quick else _places_px(dots)
         self._judged.append(JudgedFrame(places, quality))

@@ -10,10 +10,13 @@ from PySide6.QtWidgets import QProgressBar, QWidget
 from labapp.gui.live.live import Live
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.labels import Message, plain_label, set_font
+from labapp.gui.widgets.labels import Message, allow, plain_label, set_font
 from labapp.gui.widgets.layouts import hbox, vbox
 
 BEGIN, END = "● Record", "■ End recording"
+
+MARK = "Note this moment beside the recording that runs (M)"
+NOTHING_TO_MARK = "Only while it records: notes a moment beside the recording (M)"
 
 BUTTON_PX, RING_BAR_PX = 44, 96
 """Minimum size of the buttons, which are pressed with gloves; width of the memory bar."""
@@ -41,9 +44,7 @@ class RecordBar(QWidget):
             "Record from some seconds before now on, or end the recording (Space, Ctrl+R)",
             trigger,
         )
-        self.mark_button = button(
-            "Mark", "Note this moment beside the recording that runs (M)", mark
-        )
+        self.mark_button = button("Mark", "", mark)
         stop_button = button(
             "Stop camera", "Release the camera; a recording is finished first", stop
         )
@@ -68,7 +69,7 @@ class RecordBar(QWidget):
 
     def show_recording(self, recording: bool) -> None:
         """Show on the record button whether a recording runs: by text, sign and red colour."""
-        self.mark_button.setEnabled(recording)
+        allow(self.mark_button, MARK, "" if recording else NOTHING_TO_MARK)
         pressed = self.record_button
         pressed.setText(END if recording else BEGIN)
         palette = QPalette()

@@ -10,6 +10,7 @@ import pyqtgraph as pg
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 from PySide6.QtWidgets import QWidget
 
+from labapp.core.images.exposure import Exposure
 from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
 from labapp.gui.live.camera_fields import CameraFields, calibrated_px
@@ -338,7 +339,10 @@ class LiveView(QObject):
         looked = live.looked()
         if looked is not None:
             self._ring_dots(looked.dots_px)
-            if self._result is None or self._age_s > OLD_S:
+            if isinstance(looked.quality, Exposure):
+                self._exposure.show_lines(looked.quality)
+                self._exposure.show()
+            elif self._result is None or self._age_s > OLD_S:
                 self._show_quality(looked.quality)
         if live.watch is not None:
             self._follow(live.watch)
@@ -431,6 +435,7 @@ class LiveView(QObject):
         for each in (self.start_button, self.find_button):
             each.setVisible(live is None)
         allow(self.start_button, START, self._why_not())
+        self.camera.refuse(self._why_not())
         if self.workspace.session is None or self._ending:
             self.start_button.setEnabled(False)
         self.settings.setVisible(runs)

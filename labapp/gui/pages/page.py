@@ -49,6 +49,7 @@ class Page(QWidget):
         """Message at the pressed button: what was done, or why it was not."""
         self._answers = {self.answer}
         self._changing: list[QWidget] = []
+        self._latest: dict[str, tuple[Task, object]] = {}
         workspace.opened.connect(self._take_session)
 
     @property
@@ -86,6 +87,34 @@ class Page(QWidget):
             return task
         say = self._answer_in(beside).setText
         return self.workspace.tasks.start(title, work, on_done, beside=say, kind=kind)
+
+    def start_latest(
+        self,
+        title: str,
+        given: object,
+        work: Work,
+        on_done: Callable[[Any], None],
+        kind: str = "",
+    ) -> Task:
+        """Start work on what is now wanted; only the latest of its kind is used.
+
+        ``given``: what the work depends on. Running work with the same is returned, and no other
+        is started; with something else, it is cancelled, and what it returns is not used.
+        """
+        name = kind or title
+        task, former = self._latest.get(name, (None, None))
+        if task is not None and task in self.workspace.tasks.active:
+            if former == given and not task.control.cancelled.is_set():
+                return task
+            task.cancel()
+
+        def done(made: object) -> None:
+            if not begun.control.cancelled.is_set():
+                on_done(made)
+
+        begun = self.start_task(title, work, done, kind)
+        self._latest[name] = begun, given
+        return begun
 
     def _answer_in(self, beside: Message | None) -> Message:
         """The message for an outcome; it is cleared when another session is opened."""

@@ -16,11 +16,14 @@ BARS = (
 """Names and explanations, for dots or pixels."""
 
 
+LINES_NOT_JUDGED = "Lines are not judged: expose as long as nothing in them is clipped."
+
+
 class ExposureBars(Group):
     """Exposure, saturation and contrast of the frame in view, and an assessment."""
 
     def __init__(self) -> None:
-        form = QFormLayout()
+        form = self._form = QFormLayout()
         self.bars = []
         for name, _ in BARS:
             bar = QProgressBar()
@@ -32,13 +35,22 @@ class ExposureBars(Group):
 
     def show_exposure(self, exposure: Exposure, verdict: str, good: bool) -> None:
         """Show the exposure of a frame and how to correct it."""
+        self._show_bars(exposure)
+        self.verdict.setText(f"{'●' if good else '▲'} {verdict}")
+
+    def show_lines(self, exposure: Exposure) -> None:
+        """Show how bright a frame of lines is; whether it is right is not known."""
+        self._show_bars(exposure, of_lines=True)
+        self.verdict.setText(f"○ {LINES_NOT_JUDGED}")
+
+    def _show_bars(self, exposure: Exposure, of_lines: bool = False) -> None:
+        self._form.setRowVisible(self.bars[-1], not of_lines)
         of = "dots" if exposure.snr > 0 else "pixels"
         for bar, (name, tip), (part, words) in zip(self.bars, BARS, bars(exposure), strict=True):
             bar.setValue(round(100 * part))
             bar.setFormat(words)
             bar.setAccessibleName(f"{name}: {words}")
             bar.setToolTip(plain_tip(tip.format(of)))
-        self.verdict.setText(f"{'●' if good else '▲'} {verdict}")
 
 
 def bars(exposure: Exposure) -> tuple[tuple[float, str], ...]:

@@ -34,6 +34,10 @@ NUMBER = re.compile(r"[-−]?\d+(\.\d+)?(e[-+]?\d+)?( ± .+)?", re.IGNORECASE)
 """A number as text, with or without its ±."""
 
 
+TEXT = "dissertation"
+"""Heading of columns that files call ``text``: values published in the dissertation."""
+
+
 class ReadTable(QTableWidget):
     """A read-only table: whole rows are selected, and copied by keys and menu."""
 
@@ -140,7 +144,8 @@ class CellTable(ReadTable):
         self.setColumnCount(len(table.columns))
         self.setRowCount(len(table.rows))
         self.table = table  # afterwards: fewer rows end a selection, which may be read
-        self.setHorizontalHeaderLabels([column_heading(column) for column in table.columns])
+        headings = [column_heading(column) for column in table.columns]
+        self.setHorizontalHeaderLabels([re.sub(r"^text\b", TEXT, each) for each in headings])
         self.clearContents()  # a column of another table may have been right-aligned
         numbers = [_are_numbers(cells) for cells in zip(*table.rows, strict=True)]
         for row, cells in enumerate(table.rows):

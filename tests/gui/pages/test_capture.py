@@ -19,6 +19,7 @@ from labapp.core.images.find_dots import DotSettings
 from labapp.errors import InputError
 from labapp.gui import dialogs
 from labapp.gui.live.camera_fields import calibrated_px, other_size
+from labapp.gui.pages.capture import page as capture_page_module
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.pages.capture.presenter import (
     Choice,
@@ -201,6 +202,27 @@ def test_choosing_previewing_and_importing(page: CapturePage, stack: Path, qtbot
     assert page.facts_group.isVisibleTo(page.panel)
     assert not page.chosen.isVisibleTo(page.panel)
     assert page.state(NOTHING) is NOTHING
+
+
+def test_the_recording_chosen_last_is_previewed(
+    page: CapturePage, stack: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    last, release = stack.with_name("last.npy"), threading.Event()
+    shutil.copyfile(stack, last)
+
+    def opened(path: Path) -> Preview:
+        if path == stack:
+            release.wait()
+        return Preview(path)
+
+    monkeypatch.setattr(capture_page_module, "Preview", opened)
+    page.take(stack)
+    page.take(last)
+    qtbot.waitUntil(lambda: page.preview is not None)
+    release.set()
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert page.preview is not None
+    assert page.preview.path == last
 
 
 def test_cancelled_import_leaves_the_session_unchanged(

@@ -26,6 +26,7 @@ from labapp.gui.live.figures import LINES, Figure, figures
 from labapp.gui.live.live import SIMULATED, STATES, WAITS, Live, choices
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.shell.window import MainWindow
+from labapp.gui.widgets.exposure import LINES_NOT_JUDGED
 from labapp.media import GreyImage, open_source
 from labapp.media.cameras import (
     CameraInfo,
@@ -405,6 +406,7 @@ def test_lines_are_not_judged_as_dots(
     window.workspace.attempt(lambda session: session.set_setup(setup))
     view = page.live_view
     assert not view.start_button.isEnabled()  # the simulated camera films dots
+    assert view.start_button.toolTip() in view.camera.problem.text()
     view.start()
     assert view.live is None
     assert view.start_button.toolTip() in view.answer.text()
@@ -417,9 +419,16 @@ def test_lines_are_not_judged_as_dots(
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     view.camera.set_value("test:0")
     view.camera.edited.emit("test:0")
+    assert view.start_button.isEnabled()
+    assert not view.camera.problem.text()
     start(page, qtbot)
     qtbot.waitUntil(lambda: view.live.room_byte is not None and view.updates > 20)
-    assert page.exposure.isHidden()
+    qtbot.waitUntil(page.exposure.isVisible)
+    level, clipped, contrast = page.exposure.bars
+    assert level.value() == round(100 * np.percentile(image, 99.9) / 255)
+    assert clipped.value() == 0
+    assert contrast.isHidden()  # that of dots
+    assert page.exposure.verdict.text() == f"○ {LINES_NOT_JUDGED}"
     assert not len(view._rings.data)
     assert view.figures.words.text() == LINES
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from labapp.core.calibration.boards import BOARDS
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
+from labapp.gui.pages.plane import page as plane_page_module
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.page import PlanePage
 from labapp.gui.shell.steps import calibrations_in_use, states
@@ -218,6 +220,57 @@ def test_target_is_found_applied_and_undone(qtbot: QtBot, page: PlanePage) -> No
     assert (stored.found, stored.unit_mm) == (placed, 6.35)
     page.workspace.undo()
     assert session.setup_text == before
+
+
+def test_only_one_search_runs_and_it_replaces_no_dragged_point(
+    qtbot: QtBot, page: PlanePage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page.load(GTAW / "calibration.png")
+    qtbot.waitUntil(lambda: page.found is not None and page.found.threshold > 0)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    answer, release, begun = page.found, threading.Event(), threading.Semaphore(0)
+    searches: list[object] = []
+
+    def slow(*given: object) -> object:
+        searches.append(given)
+        begun.release()
+        release.wait()
+        return answer
+
+    monkeypatch.setattr(presenter, "find", slow)
+    page.find_button.click()
+    page.find_button.click()
+    qtbot.waitUntil(lambda: begun.acquire(blocking=False))
+    assert len(page.workspace.tasks.active) == len(searches) == 1
+    page.drag(0, 100.0, 200.0)
+    release.set()
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert page.found is not None
+    assert page.found.origin_px == (100.0, 200.0)
+    page.find_button.click()
+    qtbot.waitUntil(lambda: page.found == answer)
+    assert len(searches) == 2
+
+
+def test_the_picture_chosen_last_is_shown(
+    qtbot: QtBot, page: PlanePage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, release = np.zeros((20, 30), np.uint8), threading.Event()
+    last = np.ones((20, 30), np.uint8)
+
+    def read(path: Path) -> object:
+        if path.name == "first.png":
+            release.wait()
+            return first
+        return last
+
+    monkeypatch.setattr(plane_page_module, "read_picture", read)
+    page.load(Path("first.png"))
+    page.load(Path("last.png"))
+    qtbot.waitUntil(lambda: page.view.picture is last)
+    release.set()
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert page.view.picture is last
 
 
 def test_arrow_keys_move_the_selected_point(qtbot: QtBot, page: PlanePage) -> None:

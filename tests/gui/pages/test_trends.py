@@ -11,6 +11,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
+from labapp.gui.digits import with_sigma
 from labapp.gui.pages.trends.page import TrendsPage
 from labapp.gui.pages.trends.presenter import CORRECTED, STALE, TrendOptions, show
 from labapp.gui.workspace import Workspace
@@ -40,6 +41,7 @@ def test_trends_of_the_sample(gtaw: Path) -> None:
     assert span.texts[1] == "0.256 … 0.323"
     assert sure.value is not None
     assert 0.0 < sure.value < 0.019
+    assert sure.texts[1] == with_sigma(0.293, sure.value).partition(" ± ")[2]  # two digits
     assert shown.words == "30 of 30 frames count"
     assert shown.spectrum == ()
     assert shown.signals_words.startswith("None.")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pyqtgraph as pg
 from PySide6.QtCore import Qt, QTimer
@@ -24,7 +23,7 @@ from labapp.gui.pages.bench_check.mirror_form import MirrorForm
 from labapp.gui.pages.bench_check.presenter import COLUMNS, CheckResult, Predicted
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import Lead, Mark, Offer, State, no_bench_check, setup_to_do
-from labapp.gui.tasks import Control, Task, Work
+from labapp.gui.tasks import Control
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField
@@ -66,7 +65,6 @@ class BenchCheckPage(Page):
         self._path: Path | None = None
         self._kept: BenchCheckRecord | None = None
         self._found: MirrorPicture | None = None
-        self._begun: dict[str, tuple[Task, object]] = {}
         self.view = PictureView("Picture of the mirror")
         self.view.pointed.connect(lambda u, v, _: self._point(u, v))
         self._overlays: list[pg.GraphicsObject] = []
@@ -232,7 +230,7 @@ class BenchCheckPage(Page):
 
         self._show_predicted(None)
         given = chosen, text, path, settings, tuple(free), pool
-        self._begin("Checking the bench", given, work, found)
+        self.start_latest("Checking the bench", given, work, found)
 
     def find_suspect(self) -> None:
         """Repeat the check, with a quantity determined from the pictures alone."""
@@ -253,26 +251,12 @@ class BenchCheckPage(Page):
         """Predict the effect of pictures on the ± of the pool's height."""
         session = self.session
         setup, record = session.setup, session.record
-        self._begin(
+        self.start_latest(
             "Predicting the effect of pictures",
             (session.setup_text, session.path, record),
             lambda _: presenter.predicted(setup, record),
             self._show_predicted,
         )
-
-    def _begin(self, title: str, given: object, work: Work, on_done: Callable[[Any], None]) -> None:
-        """Start work unless it runs already; if it runs with other input, that is cancelled."""
-        task, former = self._begun.get(title, (None, None))
-        if task is not None and task in self.workspace.tasks.active:
-            if former == given and not task.control.cancelled.is_set():
-                return
-            task.cancel()
-
-        def done(made: object) -> None:
-            if self._begun[title][1] == given:
-                on_done(made)
-
-        self._begun[title] = self.start_task(title, work, done), given
 
     def _show_predicted(self, made: Predicted | None) -> None:
         show_words(self.predicted_words, "" if made is None else made.words)

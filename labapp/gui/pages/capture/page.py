@@ -58,7 +58,6 @@ class CapturePage(Page):
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
         self.preview: Preview | None = None
-        self._opening: Task | None = None
         self._importing: Task | None = None
         self._reading: Task | None = None
         self._wanted: tuple[Preview | None, int] | None = None
@@ -292,8 +291,12 @@ class CapturePage(Page):
         """Preview a recording for import, or import all of it immediately, see `Page.take`."""
         self._last_folder = path.parent
         self.live_view.stop()
-        if self._opening in self.workspace.tasks.active and self._opening is not None:
-            self._opening.cancel()
+
+        def work(control: Control) -> Preview:
+            preview = Preview(path)
+            if control.cancelled.is_set():
+                preview.close()
+            return preview
 
         def opened(preview: Preview) -> None:
             self._drop_preview()
@@ -310,9 +313,8 @@ class CapturePage(Page):
             self._show_import()
             self.workspace.changed.emit()
 
-        self._opening = self.start_task(
-            f"Opening {path.name}", lambda _: Preview(path), opened, kind="Opening a recording"
-        )
+        title, kind = f"Opening {path.name}", "Opening a recording"
+        self.start_latest(title, (path, at_once), work, opened, kind)
 
     def choice(self) -> Choice | None:
         """Choice of frames to import; None before a recording was chosen."""

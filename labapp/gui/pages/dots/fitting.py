@@ -90,7 +90,7 @@ class Refit:
     @property
     def pending(self) -> bool:
         """Whether a fit is running."""
-        return self._task is not None and self._task in self._space.tasks.active
+        return self._task in self._space.tasks.active
 
     def want(self, frame: int, due: bool) -> None:
         """Fit a frame if it is due because its dots or rows were changed by hand."""

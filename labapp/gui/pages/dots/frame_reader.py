@@ -85,7 +85,7 @@ class FrameReader(QObject):
 
     @property
     def _busy(self) -> bool:
-        return self._task is not None and self._task in self._space.tasks.active
+        return self._task in self._space.tasks.active
 
     def _look(self) -> None:
         session, image, frame = self._space.session, self.image, self.frame

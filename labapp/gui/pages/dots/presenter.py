@@ -294,9 +294,9 @@ def compared(before: Figures | None, after: Figures | None, pending: str = "") -
         last = pending or last
         return last if before is None else f"{first} → {last}"
 
-    def length(name: str, digits: int = 3) -> str:
+    def length(name: str) -> str:
         values = [math.nan if f is None else getattr(f, name) for f in (before, after)]
-        return pair([plain(v, digits) if math.isfinite(v) else "–" for v in values])
+        return pair([plain(v, 3) if math.isfinite(v) else "–" for v in values])
 
     texts = [("–", "–") if f is None else (f.status, str(f.matched)) for f in (before, after)]
     sigma = math.nan if after is None or pending else after.height_sigma_mm

@@ -91,7 +91,9 @@ class LaserPage(Page):
 
     def load_picture(self, path: Path) -> None:
         """Show a picture of the cross with points to drag."""
-        self.start_task("Loading the picture", lambda _: read_picture(path), self._show_picture)
+        self.start_latest(
+            "Loading the picture", path, lambda _: read_picture(path), self._show_picture
+        )
 
     def add_reading(self) -> None:
         """Add the lengths from the picture to the table as another reading."""

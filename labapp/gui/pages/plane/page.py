@@ -19,6 +19,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.presenter import POINTS
 from labapp.gui.shell.steps import Lead, Offer
+from labapp.gui.tasks import Task
 from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
@@ -58,6 +59,7 @@ class PlanePage(Page):
         self._tilted: tuple[GreyImage, ...] = ()
         self._name = "picture"
         self._loaded: object = None
+        self._finding: Task | None = None
         self._axes = pg.PlotDataItem(pen=pg.mkPen(COLOR, width=1.5))
         self._marks = pg.PlotDataItem(
             pen=None, symbol="+", symbolSize=11, symbolPen=pg.mkPen(COLOR, width=1.5)
@@ -89,7 +91,7 @@ class PlanePage(Page):
             self._show(image, None)
             self.find_axes()
 
-        self.start_task("Loading the picture", lambda _: read_picture(path), loaded)
+        self.start_latest("Loading the picture", path, lambda _: read_picture(path), loaded)
 
     def add_picture(self, path: Path) -> None:
         """Add a picture of the board in another pose."""
@@ -132,8 +134,11 @@ class PlanePage(Page):
                     self.square.set_value(calibration.board.square_mm)
                 self._place(presenter.with_unit(calibration, self._unit()))
 
-        self.start_task(
-            "Looking for O′ and the axes", lambda _: presenter.find(images, unit, lens), found
+        self._finding = self.start_latest(
+            "Looking for O′ and the axes",
+            (tuple(map(id, images)), unit, lens),
+            lambda _: presenter.find(images, unit, lens),
+            found,
         )
 
     def use(self) -> None:
@@ -326,6 +331,8 @@ class PlanePage(Page):
     def drag(self, point: int, u: float, v: float) -> None:
         """Move one of the points."""
         if isinstance(self.found, PlaneCalibration):
+            if self._finding is not None:
+                self._finding.cancel()  # otherwise it would replace the operator's point
             self.found = presenter.moved(self.found, point, (u, v))
             self._follow()
 

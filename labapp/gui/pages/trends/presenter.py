@@ -237,8 +237,11 @@ def _curve(course: Trend, events: Sequence[Event]) -> Curve:
 
 def _rows(course: Trend) -> tuple[ResultRow, ...]:
     found, quantity = statistics_of(course), course.quantity
-    place = rounded(found.mean, found.deviation)[0].partition(".")[2]
-    ends = [f"{end:.{len(place)}f}" for end in (found.lowest, found.highest)]
+    place, sure_place = (
+        len(rounded(found.mean, sigma)[0].partition(".")[2])
+        for sigma in (found.deviation, found.mean_sigma)
+    )
+    ends = [f"{end:.{place}f}" for end in (found.lowest, found.highest)]
     frames = f"{found.count} frame{'s' * (found.count != 1)}"
     note = f"Mean and standard deviation (divided by n, Eq. 7-2 … 7-4) of {frames}"
     sure = (
@@ -250,7 +253,7 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
         ResultRow(quantity.label, found.mean, found.deviation, quantity.unit, note=note),
         ResultRow("range", unknown, unit=quantity.unit, note=f"Smallest and largest of {frames}"),
         *(
-            [ResultRow("mean ±", found.mean_sigma, unit=quantity.unit, decimals=4, note=sure)]
+            [ResultRow("± of the mean", found.mean_sigma, None, quantity.unit, sure_place, sure)]
             if math.isfinite(found.mean_sigma)
             else []
         ),
