@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -133,16 +133,22 @@ class ProjectedRays(ReadOnlyArrays):
         Unit directions, shape (rows, columns, 3).
     landing_mm
         Intersections with the work piece, shape (rows, columns, 3), mm.
-    spacing_mm
-        Distance between neighbouring landing points along X and along Y, shape (2,), mm.
     absent
         Whether a ray is absent from the pattern, shape (rows, columns).
     """
 
     directions: FloatArray
     landing_mm: FloatArray
-    spacing_mm: FloatArray
     absent: BoolArray
+
+    @cached_property
+    def spacing_mm(self) -> FloatArray:
+        """Median distance of neighbouring landing points along X and along Y, shape (2,), mm."""
+        across = np.median(np.diff(self.landing_mm[..., 0], axis=1))
+        along = np.median(np.diff(self.landing_mm[..., 1], axis=0))
+        spacing = np.abs([across, along])
+        spacing.flags.writeable = False
+        return spacing
 
 
 @lru_cache(maxsize=64)
@@ -153,11 +159,4 @@ def project_rays(laser: Laser, pattern: DotPattern) -> ProjectedRays:
     absent = np.zeros(directions.shape[:2], bool)
     for i, j in pattern.absent_rays:
         absent[i - 1, j - 1] = True
-    return ProjectedRays(directions, landing, landing_spacing(landing), absent)
-
-
-def landing_spacing(landing_mm: FloatArray) -> FloatArray:
-    """Median distance of neighbouring landing points along X and along Y, shape (2,), mm."""
-    across = np.median(np.diff(landing_mm[..., 0], axis=1))
-    along = np.median(np.diff(landing_mm[..., 1], axis=0))
-    return np.asarray(np.abs([across, along]), float)
+    return ProjectedRays(directions, landing, absent)

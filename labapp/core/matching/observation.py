@@ -162,9 +162,10 @@ class Observation(ReadOnlyArrays):
         """
         key = labels.tobytes(), witness.tobytes(), settings
         if key not in self._fitted:
-            at = np.argwhere(labels != UNLABELLED)
-            dot = labels[tuple(at.T)]
-            matched = MatchedDots(at + 1, self.plane_mm[dot], self.covariance_mm2[dot], witness)
+            at = (labels != UNLABELLED).nonzero()
+            dot, ray = labels[at], np.transpose(at) + 1
+            plane_mm, covariance = self.plane_mm.take(dot, 0), self.covariance_mm2.take(dot, 0)
+            matched = MatchedDots(ray, plane_mm, covariance, witness)
             near = None if initial is None else initial.surface
             try:
                 pool = fit_pool(matched, self.rig, settings, near)

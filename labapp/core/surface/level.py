@@ -154,9 +154,9 @@ class Witnesses(ReadOnlyArrays):
     ) -> Witnesses:
         """Select those of `Match.witness`, shape (rows, columns), within the spline domain."""
         landing = rays.landing_mm
-        known = witness != 0
-        if known.any():
-            known &= basis.contains(landing[..., 0], landing[..., 1])
+        if not witness.any():
+            return cls(landing[0, :0], witness[0, :0], rays.spacing_mm, head_sign, missing)
+        known = (witness != 0) & basis.contains(landing[..., 0], landing[..., 1])
         return cls(landing[known], witness[known], rays.spacing_mm, head_sign, missing)
 
     def negative_log_evidence(

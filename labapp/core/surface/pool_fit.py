@@ -34,13 +34,7 @@ from labapp.core.surface.solver import (
     propagate_sigma,
 )
 from labapp.core.surface.spline import SplineBasis, SplineSurface
-from labapp.core.values import (
-    BoolArray,
-    CannotMeasure,
-    FloatArray,
-    ReadOnlyArrays,
-    median,
-)
+from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 
 MARGIN_ROWS, LEAST_MARGIN_MM = 2.5, 2.0
 """Margin of the splines beyond the outermost reflection points, in rows of rays, and its minimum,
@@ -163,10 +157,12 @@ def fit_pool(
     CannotMeasure
         ``no-surface`` if no surface can be fitted or it sends rays away from the plane.
     """
-    from labapp.core.surface.kernels import solver_kernels
+    from labapp.core.surface.kernels import ray_kernels, solver_kernels
 
-    rays, at = project_rays(rig.laser, rig.pattern), tuple(match.ray.T - 1)
-    points = rays.landing_mm[at]
+    rays = project_rays(rig.laser, rig.pattern)
+    directions, points, is_outer = ray_kernels.rays_of_pairs(
+        match.ray, rays.directions, rays.landing_mm
+    )
     basis = basis_around(points[:, :2], rays, settings.knot_mm)
     if basis.count > MOST_SPLINES:
         width, length = basis.high_mm - basis.low_mm
@@ -177,11 +173,11 @@ def fit_pool(
     equations.reuse_mm = REUSE_FLOORS * settings.floor_mm
     if initial is not None:
         points, _ = solver_kernels.newton_along_rays(
-            initial.basis.grid, initial.coefficients, rays.directions[at], points, NEWTON_STEPS
+            initial.basis.grid, initial.coefficients, directions, points, NEWTON_STEPS
         )
-    rounds = Rounds(equations, rays.directions[at], np.zeros(basis.count), points, np.inf)
+    rounds = Rounds(equations, directions, np.zeros(basis.count), points, np.inf)
     witnesses = Witnesses.of(rays, rig.head_sign, match.witness, basis, match.missing)
-    outer = None if (witnesses.witness < 0).any() else _outer(rays.landing_mm[at][:, :2])
+    outer = None if (witnesses.witness < 0).any() else is_outer
     most, until_mm = settings.rounds, settings.settled_mm
     level = rounds.run(most, until_mm, search=LevelSearch(witnesses, outer=outer))
     if weigh_by_height_sigma and outer is None:
@@ -212,13 +208,6 @@ def normal_equations(
     )
     stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness_matrix
     return NormalEquations(basis, stiffness, laser, plane, dots, weights)
-
-
-def _outer(places_mm: FloatArray) -> BoolArray:
-    """Mask of the places, shape (n, 2), farther from their centre than the median distance."""
-    offset = places_mm - places_mm.sum(axis=0) / len(places_mm)
-    square = np.vecdot(offset, offset)
-    return np.asarray(square > median(square))
 
 
 def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) -> FittedPool:

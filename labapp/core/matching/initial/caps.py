@@ -7,6 +7,7 @@ about the right height and position, which suffices as a start.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from labapp.core.matching.hypothesis import rough_costs
 from labapp.core.matching.label_growth import matched_labels
 from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try_fit
+from labapp.core.surface.pool_fit import FittedPool
 from labapp.core.values import FloatArray, IntArray
 
 _ASPECTS = (0.9, 1.1, 1.35)
@@ -44,25 +46,30 @@ ALIKE, MOST_CAPS = 0.9, 150
 and the number of caps that are examined further. A cap with 29 of 30 rays correct may match fewer
 dots than one with 21 of 33: the smoothness of the surface through their dots distinguishes them."""
 
-MOST_RETURNED = 24
-"""Number of labels that `search_caps` returns: growing labels takes most of the time."""
+FIRST_CAPS, FIRST_YIELDED = 40, 8
+"""Caps with the smallest residuals that are examined before the others, and number of their labels
+that `search_caps` yields first. In 5 frames that only caps explained, the ones that led to a
+surface had the 8 smallest residuals, and were among the 6 best of all."""
+
+MOST_YIELDED = 24
+"""Number of the best labels of all caps: growing labels takes most of the time."""
 
 
-def search_caps(observed: Observation) -> list[IntArray]:
+def search_caps(observed: Observation) -> Iterator[IntArray]:
     """Find the caps whose predicted dots match the observed dots best.
 
-    The best `MOST_CAPS` are sorted by the cost of a surface fitted to their dots; the first
-    `MOST_RETURNED` are returned, all different.
+    The best `MOST_CAPS` are sorted by the cost of a surface fitted to their dots. As the first ones
+    usually suffice, those of the `FIRST_CAPS` likeliest are yielded before all caps are sorted.
 
     Parameters
     ----------
     observed
         The dots and the rig.
 
-    Returns
-    -------
-    list of IntArray
-        Index of the dot of each ray or `UNLABELLED`, shape (rows, columns), best first.
+    Yields
+    ------
+    IntArray
+        Index of the dot of each ray or `UNLABELLED`, shape (rows, columns), all different.
     """
     from labapp.core.matching.initial import quadric_kernels
 
@@ -86,19 +93,31 @@ def search_caps(observed: Observation) -> list[IntArray]:
             if count == MOST_CAPS:
                 break
     shape = observed.rays.absent.shape
-    matched = [one for k in range(count) if (one := _matched(observed, best[k].reshape(shape)))]
-    matched.sort(key=lambda one: one[0])
-    return list({labels.tobytes(): labels for _, labels in matched}.values())[:MOST_RETURNED]
+    likely = [
+        (pool.residual_rms_mm / np.sqrt(len(pool.residual_mm)), k, pool)
+        for k in range(count)
+        if (pool := try_fit(observed, best[k].reshape(shape), QUICK))
+    ]
+    likely.sort(key=lambda one: one[0])
+    matched: list[tuple[float, IntArray]] = []
+    known: set[bytes] = set()
+    for part, most in ((likely[:FIRST_CAPS], FIRST_YIELDED), (likely[FIRST_CAPS:], MOST_YIELDED)):
+        each = (_matched(observed, best[k].reshape(shape), pool) for _, k, pool in part)
+        matched = sorted([*matched, *filter(None, each)], key=lambda one: one[0])
+        ranked = {labels.tobytes(): labels for _, labels in matched}
+        for key, labels in list(ranked.items())[:most]:
+            if key not in known:
+                known.add(key)
+                yield labels
 
 
-def _matched(observed: Observation, labels: IntArray) -> tuple[float, IntArray] | None:
-    """Cost and labels after one fit to the labels of a cap and one prediction from that fit."""
-    pool = try_fit(observed, labels, QUICK)
-    if pool is None:
-        return None
+def _matched(
+    observed: Observation, labels: IntArray, pool: FittedPool
+) -> tuple[float, IntArray] | None:
+    """Cost and labels after one prediction from the fit to those of a cap, and a second fit."""
     labels = matched_labels(observed, pool, labels)
-    pool = try_fit(observed, labels, QUICK, pool)
-    return None if pool is None else (rough_costs(observed, labels, pool)[1], labels)
+    fitted = try_fit(observed, labels, QUICK, pool)
+    return None if fitted is None else (rough_costs(observed, labels, fitted)[1], labels)
 
 
 def _caps(observed: Observation) -> FloatArray:

@@ -6,12 +6,15 @@ Arguments have the meanings that the package gives.
 from __future__ import annotations
 
 import numpy as np
+from numba import types
 
 from labapp.core.compiled import FLOAT, FLOATS_1, FLOATS_2, FLOATS_3, INT
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
 from labapp.core.surface.kernels.spline_kernels import height_and_slopes
-from labapp.core.values import BoolArray, FloatArray
+from labapp.core.values import BoolArray, FloatArray, IntArray
+
+_INTS_2 = types.Array(INT, 2, "A", readonly=True)
 
 LONGEST_STEP_MM, LEAST_DESCENT = 0.5, 0.05
 """Longest Newton step along a ray, mm, and the least descent towards the surface that is assumed
@@ -121,6 +124,38 @@ def without_glass(
         tangent -= off / (air + glass * index * index * share**3)
     farther = abs(gap) * tangent / aside - 1.0 if aside > 0.0 else 0.0
     return dot[0] + farther * x, dot[1] + farther * y, dot[2] + farther * z
+
+
+@_compiled(_INTS_2, FLOATS_3, FLOATS_3)
+def rays_of_pairs(
+    ray: IntArray, directions: FloatArray, landing: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Rays of n pairs, where they land, and which land far from the centre.
+
+    Parameters
+    ----------
+    ray
+        Row and column of each, counted from 1, shape (n, 2).
+    directions, landing
+        Of all rays of the pattern, shapes (rows, columns, 3), the latter in mm.
+
+    Returns
+    -------
+    rays, points, outer
+        Directions, shape (n, 3), and landing points, shape (n, 3), mm; and which of these are
+        farther from their centre than the median distance, shape (n,).
+    """
+    rays, points = np.empty((len(ray), 3)), np.empty((len(ray), 3))
+    x, y = 0.0, 0.0
+    for n in range(len(ray)):
+        i, j = ray[n, 0] - 1, ray[n, 1] - 1
+        for axis in range(3):
+            rays[n, axis], points[n, axis] = directions[i, j, axis], landing[i, j, axis]
+        x, y = x + points[n, 0] / len(ray), y + points[n, 1] / len(ray)
+    square = np.empty(len(ray))
+    for n in range(len(ray)):
+        square[n] = (points[n, 0] - x) ** 2 + (points[n, 1] - y) ** 2
+    return rays, points, square > np.median(square)
 
 
 @_compiled(FLOATS_2, FLOATS_1, FLOATS_2, FLOATS_2, INT, FLOATS_2)
