@@ -18,6 +18,7 @@ from labapp.core.matching.hypothesis import (
     evaluate,
     evaluate_averaged,
     grow_and_evaluate,
+    orientation_of,
     paths_of,
     reoriented_labels,
     rough_costs,
@@ -93,7 +94,7 @@ def decide(
     orientation = best.orientation(observed)
     _refuse_marker(observed, best, found)
     doubtful: list[int] = []
-    rivals: list[Hypothesis] = []
+    rivals: list[tuple[IntArray, float]] = []
     others = (
         reoriented_labels(observed, best.labels, orientation, other)
         for other in settings.orientations
@@ -105,17 +106,12 @@ def decide(
         differing, shared = _differing(best, other)
         if len(differing) <= MOST_DIFFERING * shared:
             doubtful += differing
-        elif other.orientation(observed) != orientation:
-            raise CannotMeasure(
-                "ambiguous-orientation",
-                f"{orientation} and {other.orientation(observed)} explain the dots equally well",
-            )
         else:
-            rivals.append(other)
+            rivals.append((other.labels, _excess(other, cheapest)))
     best = _without(observed, best, doubtful, fit_settings)
     best = supported(observed, best, fit_settings)
     open_holes = holes_left_open(observed, best, fit_settings, settings.margin)
-    return best, _with_rivals(open_holes, best, cheapest, rivals)
+    return best, with_rivals(observed, open_holes, best.labels, rivals)
 
 
 def _refuse_marker(observed: Observation, best: Hypothesis, found: list[Hypothesis]) -> None:
@@ -132,35 +128,47 @@ def _refuse_marker(observed: Observation, best: Hypothesis, found: list[Hypothes
         )
 
 
-def _with_rivals(
-    open_holes: list[FreeHypothesis],
-    best: Hypothesis,
-    cheapest: Hypothesis,
-    rivals: list[Hypothesis],
-) -> list[FreeHypothesis]:
-    """Add to the open holes those of rivals that are close with the set-up as entered.
+def _excess(rival: Hypothesis, cheapest: Hypothesis) -> float:
+    """How much more a rival costs, with or without the marker.
 
-    Costs of rivals are relative to ``cheapest``, the best hypothesis before the removal of doubtful
-    labels. Raise ``ambiguous-rows`` if a rival differs only in a part of the rows.
+    It is compared with the best hypothesis before the removal of doubtful labels.
     """
-    if rivals and not open_holes:
-        open_holes = [FreeHypothesis(best.labels, cost=best.cost)]
-    for rival in rivals:
-        step = _step(best, rival)
+    without_marker = rival.cost_without_marker - cheapest.cost_without_marker
+    return min(rival.cost - cheapest.cost, without_marker)
+
+
+def with_rivals(
+    observed: Observation,
+    open_holes: list[FreeHypothesis],
+    best: IntArray,
+    rivals: Iterable[tuple[IntArray, float]],
+) -> list[FreeHypothesis]:
+    """Add to the open holes those of rivals, given as their labels and how much more they cost.
+
+    Raise ``ambiguous-orientation`` if a rival has another orientation than the best labels, and
+    ``ambiguous-rows`` if it differs from them only in a part of the rows.
+    """
+    orientation = orientation_of(observed, best)
+    for labels, excess in rivals:
+        other = orientation_of(observed, labels)
+        if other != orientation:
+            raise CannotMeasure(
+                "ambiguous-orientation", f"{orientation} and {other} explain the dots equally well"
+            )
+        step = _step(best, labels)
         if not any(step):
             raise CannotMeasure("ambiguous-rows", "parts of the rows can be shifted by one")
+        open_holes = open_holes or [FreeHypothesis(best, cost=0.0)]
         if step not in {each.step for each in open_holes}:
-            with_marker = rival.cost - cheapest.cost
-            without = rival.cost_without_marker - cheapest.cost_without_marker
-            cost = open_holes[0].cost + min(with_marker, without)
-            open_holes = [*open_holes, FreeHypothesis(rival.labels, step, cost)]
+            cost = open_holes[0].cost + excess
+            open_holes = [*open_holes, FreeHypothesis(labels, step, cost)]
     return open_holes
 
 
-def _step(one: Hypothesis, other: Hypothesis) -> tuple[int, int]:
-    """Rows and columns by which the rays of most dots are shifted in another hypothesis."""
+def _step(one: IntArray, other: IntArray) -> tuple[int, int]:
+    """Rows and columns by which the rays of most dots are shifted in other labels."""
     rays = _rays_of_dots(one, other)
-    at = np.stack(np.divmod(rays[:, (rays >= 0).all(axis=0)], one.labels.shape[1]), axis=-1)
+    at = np.stack(np.divmod(rays[:, (rays >= 0).all(axis=0)], one.shape[1]), axis=-1)
     steps, counts = np.unique(at[1] - at[0], axis=0, return_counts=True)
     row, column = steps[np.argmax(counts)]
     return int(row), int(column)
@@ -361,15 +369,15 @@ def _rivals(
 
 def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:
     """Dots with different rays in two hypotheses, and the number of dots with a ray in both."""
-    own, others = _rays_of_dots(one, other)
+    own, others = _rays_of_dots(one.labels, other.labels)
     shared = (own >= 0) & (others >= 0)
     return np.flatnonzero(shared & (own != others)).tolist(), int(np.count_nonzero(shared))
 
 
-def _rays_of_dots(one: Hypothesis, other: Hypothesis) -> IntArray:
-    """Flat index of each dot's ray in two hypotheses, or −1, shape (2, dots)."""
-    rays = np.full((2, max(one.labels.max(), other.labels.max()) + 1), -1)
-    for ray, labels in zip(rays, (one.labels, other.labels), strict=True):
+def _rays_of_dots(one: IntArray, other: IntArray) -> IntArray:
+    """Flat index of each dot's ray in two sets of labels, or −1, shape (2, dots)."""
+    rays = np.full((2, max(one.max(), other.max()) + 1), -1)
+    for ray, labels in zip(rays, (one, other), strict=True):
         lit = np.flatnonzero(labels != UNLABELLED)
         ray[labels.flat[lit]] = lit
     return rays

@@ -30,7 +30,7 @@ from labapp.core.matching.hypothesis import (
     shifted_by,
     variance_mm2,
 )
-from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
+from labapp.core.matching.observation import UNLABELLED, Observation, amid, try_fit
 from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.surface.setup_uncertainty import fit_changes, perturbed
 from labapp.core.values import FloatArray, IntArray
@@ -38,6 +38,9 @@ from labapp.core.values import FloatArray, IntArray
 MOST_STEPS, LEAST_GAIN, MOST_GAIN = 4, 1.0, 30.0
 """Largest number of steps to the likeliest set-up; decrease of the cost that justifies another; and
 the most that all steps after the first were seen to gain, in units of χ²."""
+
+MOST_STARTS = 8
+"""Maximum number of hypotheses whose set-up is freed if that as entered explains none."""
 
 SETUP_GAIN = 80.0
 """If another set-up lowers the cost of a hypothesis by more, the one as entered is in doubt. With
@@ -84,8 +87,9 @@ def holes_left_open(
     """Hypotheses for each hole that may be the marker's, with a free set-up.
 
     Labels are those of the hypothesis, and those shifted by up to two rows or columns whose cost is
-    higher by less than a margin. Shifts that place a dot at the marker's absent ray are omitted, as
-    no set-up explains it. If the rig is known exactly, there are none.
+    higher by less than a margin; if the set-up is in doubt, also those with the marker in any hole
+    between labelled rays. Shifts that place a dot at the marker's absent ray are omitted, as no
+    set-up explains it. If the rig is known exactly, there are none.
 
     Parameters
     ----------
@@ -103,12 +107,14 @@ def holes_left_open(
     list
         The hypothesis itself first, then its rivals; empty if it has none.
     """
-    steps = [] if observed.rig.uncertainty is None else _steps_to_other_holes(observed, best)
-    if not steps:
+    near, far = _steps_to_near_holes(observed, best.labels), _steps_to_holes(observed, best.labels)
+    if observed.rig.uncertainty is None or not (near or far):
         return []
     own = with_setup_free(observed, best, fit_settings)
-    # If the set-up is in doubt, shifted labels may cost much less once they are grown.
-    most = own.cost + margin + (MOST_GAIN if own.gain > SETUP_GAIN else 0.0)
+    steps, most = near, own.cost + margin
+    if own.gain > SETUP_GAIN:
+        # Shifted labels may cost much less once they are grown, and the right rows be far.
+        steps, most = sorted({*near, *far}), most + MOST_GAIN
     rivals = []
     for step in steps:
         shifted = evaluate(observed, shifted_by(observed, own.labels, step))
@@ -119,12 +125,52 @@ def holes_left_open(
     return [own, *rivals] if rivals else []
 
 
-def _steps_to_other_holes(observed: Observation, best: Hypothesis) -> list[tuple[int, int]]:
-    """Shifts of the labels, in rows and columns, that place the marker in another hole."""
+def _steps_to_near_holes(observed: Observation, labels: IntArray) -> list[tuple[int, int]]:
+    """Shifts of labels by up to two rows and columns that place the marker in another hole."""
     marker = observed.rig.pattern.marker
     assert marker is not None
-    holes = np.pad(best.labels == UNLABELLED, 2)  # beyond the pattern is no hole
+    holes = np.pad(labels == UNLABELLED, 2)  # beyond the pattern is no hole
     return [step for step in SHIFTS if holes[marker[0] + 1 - step[0], marker[1] + 1 - step[1]]]
+
+
+def with_setups_free(
+    observed: Observation, found: list[Hypothesis], fit_settings: FitSettings
+) -> list[FreeHypothesis]:
+    """Free the set-up of the `MOST_STARTS` cheapest hypotheses that differ in most labels.
+
+    With a wrong set-up the correct labels may cost more than others.
+    """
+    distinct: list[Hypothesis] = []
+    for each in sorted(found, key=lambda hypothesis: hypothesis.cost):
+        if not any(mostly_equal(each.labels, other.labels) for other in distinct):
+            distinct.append(each)
+    return [with_setup_free(observed, each, fit_settings) for each in distinct[:MOST_STARTS]]
+
+
+def shifted_to_holes(
+    observed: Observation, labels: IntArray, fit_settings: FitSettings
+) -> list[FreeHypothesis]:
+    """Free the set-up of labels shifted so that the marker is in each hole between labelled rays.
+
+    The labels themselves come first.
+    """
+    steps = [(0, 0), *_steps_to_holes(observed, labels)]
+    shifted = (evaluate(observed, shifted_by(observed, labels, step)) for step in steps)
+    return [with_setup_free(observed, each, fit_settings) for each in shifted if each]
+
+
+def _steps_to_holes(observed: Observation, labels: IntArray) -> list[tuple[int, int]]:
+    """Shifts of labels that place the marker in another hole between labelled rays."""
+    marker, lit = observed.rig.pattern.marker, labels != UNLABELLED
+    assert marker is not None
+    steps = marker - np.array([1, 1]) - np.argwhere(amid(lit) & ~lit)
+    return [(row, column) for row, column in steps.tolist() if row or column]
+
+
+def mostly_equal(one: IntArray, other: IntArray) -> bool:
+    """Whether most of the labelled rays have the same dot in other labels."""
+    lit = one != UNLABELLED
+    return bool(np.mean(one[lit] == other[lit]) > 0.5)
 
 
 def with_setup_free(
@@ -228,4 +274,7 @@ def _step(
     normal = jacobian.T @ jacobian + np.eye(len(deviation)) + coefficients.T @ rough
     rhs = jacobian.T @ (pool.residual_mm.ravel() / sigma)[finite] + deviation
     rhs += rough.T @ pool.surface.coefficients
-    return -np.linalg.solve(normal, rhs), float(np.linalg.slogdet(normal).logabsdet)
+    # Its eigenvalues are at least 1; for labels that hardly fit, rounding may hide this.
+    values, vectors = np.linalg.eigh(normal)
+    values = np.maximum(values, 1.0)
+    return -vectors @ (vectors.T @ rhs / values), float(np.log(values).sum())

@@ -159,12 +159,17 @@ class Hypothesis:
 
     def orientation(self, observed: Observation) -> Orientation:
         """Determine the orientation of the labels."""
-        at = np.argwhere(self.labels != UNLABELLED)
-        place = np.full((*self.labels.shape, 2), np.nan)
-        place[at[:, 0], at[:, 1]] = observed.plane_mm[self.labels[at[:, 0], at[:, 1]]]
-        if np.nansum(np.sign(np.diff(place[..., 1], axis=0))) >= 0:
-            return "S/S"
-        return "S/I" if np.nansum(np.sign(np.diff(place[..., 0], axis=1))) >= 0 else "I/I"
+        return orientation_of(observed, self.labels)
+
+
+def orientation_of(observed: Observation, labels: IntArray) -> Orientation:
+    """Determine the orientation of labels from the directions of their rows and columns."""
+    at = np.argwhere(labels != UNLABELLED)
+    place = np.full((*labels.shape, 2), np.nan)
+    place[at[:, 0], at[:, 1]] = observed.plane_mm[labels[at[:, 0], at[:, 1]]]
+    if np.nansum(np.sign(np.diff(place[..., 1], axis=0))) >= 0:
+        return "S/S"
+    return "S/I" if np.nansum(np.sign(np.diff(place[..., 0], axis=1))) >= 0 else "I/I"
 
 
 def grow_and_evaluate(
