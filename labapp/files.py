@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from labapp.errors import InputError, os_errors_as_input
 
 
@@ -108,6 +106,8 @@ def only_writer(target: Path) -> Iterator[bool]:
     InputError
         If another program has locked it.
     """
+    from filelock import FileLock, Timeout
+
     path = target.with_name(f".{target.name}.lock")
     lock = FileLock(path)
     try:

@@ -939,7 +939,7 @@ def test_version_is_printed(labapp: Run) -> None:
 @pytest.mark.parametrize(
     ("start", "heavy"),
     [
-        ("import labapp.cli", {"numpy", "scipy", "cv2", "rich", "pyvista", "matplotlib"}),
+        ("import labapp.cli", {"numpy", "rich", "pyvista", "filelock", "labapp.cli.session"}),
         (
             "from labapp import Session",
             {"scipy", "cv2", "av", "numba", "h5py", "matplotlib", "labapp.core.pipeline"},

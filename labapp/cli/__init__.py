@@ -22,20 +22,16 @@ import typer
 import typer.core
 import typer.main
 
-from labapp.cli import (
-    calibrate,
-    cameras,
-    demo,
-    detect,
-    dynamics,
-    lines,
-    penetration,
-    reconstruct,
-    session,
-    study,
+from labapp.cli import cameras, demo, detect, dynamics, lines, reconstruct
+from labapp.cli.shared import (
+    BAD_INPUT,
+    FAULT,
+    INTERRUPTED,
+    TERMINATED,
+    Commands,
+    loaded_commands,
 )
-from labapp.cli.shared import BAD_INPUT, FAULT, INTERRUPTED, TERMINATED, Commands
-from labapp.cli.simulation import advise, analyze, benchmark, simulate
+from labapp.cli.simulation import advise, benchmark, simulate
 from labapp.cli.window import asks_for_app, open_app
 from labapp.errors import InputError
 from labapp.log import log_file, start_log
@@ -43,6 +39,28 @@ from labapp.version import VERSION
 
 IMPATIENT_S = 2.0
 """A further interrupt within this time is ignored, as the first is still being handled, s."""
+
+GROUPS = {
+    "calibrate": ("labapp.cli.calibrate", "Calibrate laser or imaging plane, or check both."),
+    "analyze": (
+        "labapp.cli.simulation.analyze",
+        "Reproduce tables and figures of chapters 4, 6 and 8; the error budget of a set-up.",
+    ),
+    "session": (
+        "labapp.cli.session",
+        "Keep an experiment in one file: set-up, recording, corrections, results.",
+    ),
+    "study": (
+        "labapp.cli.study",
+        "Measure many recordings with the same settings, on all cores or a cluster, and compare "
+        "them.",
+    ),
+    "penetration": (
+        "labapp.cli.penetration",
+        "Predict penetration from the pool's surface by models fitted to sections.",
+    ),
+}
+"""Modules whose ``app`` has the commands of a group, and what these do."""
 
 app = typer.Typer(
     name="labapp",
@@ -62,11 +80,10 @@ app = typer.Typer(
     epilog="Exit codes: 0 done; 1 done, but nothing could be measured, or a session is not whole; "
     "2 bad input or output; 3 a fault in labapp; 130 stopped by Ctrl-C; 143 by SIGTERM.",
 )
-app.add_typer(calibrate.app, name="calibrate")
-app.add_typer(analyze.app, name="analyze")
-app.add_typer(session.app, name="session")
-app.add_typer(study.app, name="study")
-app.add_typer(penetration.app, name="penetration")
+for name, (module, about) in GROUPS.items():
+    app.add_typer(
+        typer.Typer(), name=name, cls=loaded_commands(module), help=about, no_args_is_help=True
+    )
 app.command()(simulate.simulate)
 app.command()(advise.advise)
 app.command()(cameras.cameras)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from labapp.cli.shared import Commands, check_target, progress_shown
+from labapp.cli.shared import check_target, command_group, progress_shown
 from labapp.errors import InputError
 from labapp.files import as_bytes, write_file
 from labapp.system import quoted
@@ -18,11 +18,7 @@ if TYPE_CHECKING:
     from labapp.core.dynamics.penetration import Kind, LeftOut, PenetrationModel, Prediction
     from labapp.core.dynamics.weld_series import WeldSeries
 
-app = typer.Typer(
-    cls=Commands,
-    no_args_is_help=True,
-    help="Predict penetration from the pool's surface by models fitted to sections.",
-)
+app = command_group()
 
 MATCHED_S = 0.2
 """Largest time difference between a transition and its prediction, s."""

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 import typer.core
+import typer.main
 
 from labapp.core.schemes import SCHEMES, algorithm_names, scheme_words
 from labapp.errors import InputError, os_errors_as_input
@@ -127,7 +130,7 @@ class Commands(typer.core.TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        for command in self.commands.values():
+        for command in attributes["commands"].values():
             for one in command.params:  # Typer has no setting for the class of a parameter
                 is_option = isinstance(one, typer.core.TyperOption)
                 one.__class__ = Option if is_option else Argument
@@ -138,6 +141,34 @@ class Commands(typer.core.TyperGroup):
             formatter.write_dl(
                 [(name, one.get_short_help_str(limit=1000)) for name, one in self.commands.items()]
             )
+
+
+def command_group() -> typer.Typer:
+    """Return an empty group of commands."""
+    return typer.Typer(cls=Commands, rich_markup_mode=None)
+
+
+def loaded_commands(module: str) -> type[Commands]:
+    """Return a class of group whose commands are those of a module, loaded when they are needed.
+
+    Most of the time that the command line needs to start goes into commands that are not run.
+    """
+
+    class LoadedCommands(Commands):
+        @cached_property
+        def loaded(self) -> MutableMapping[str, Any]:
+            """Commands by name."""
+            return typer.main.get_group(import_module(module).app).commands
+
+        @property
+        def commands(self) -> MutableMapping[str, Any]:
+            return self.loaded
+
+        @commands.setter
+        def commands(self, none: object) -> None:
+            """Ignore the empty dictionary that a group is created with."""
+
+    return LoadedCommands
 
 
 def with_methods(

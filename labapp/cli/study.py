@@ -10,7 +10,7 @@ import typer
 from labapp.cli.shared import (
     INTERRUPTED,
     NOTHING_MEASURED,
-    Commands,
+    command_group,
     note,
     progress_bar,
 )
@@ -21,12 +21,7 @@ if TYPE_CHECKING:
     from labapp.run.study.status import StudyProgress
     from labapp.run.study.study import Study
 
-app = typer.Typer(
-    cls=Commands,
-    no_args_is_help=True,
-    help="Measure many recordings with the same settings, on all cores or a cluster, and compare "
-    "them.",
-)
+app = command_group()
 
 File = Annotated[Path, typer.Argument(metavar="STUDY", help="The study file (TOML or CSV).")]
 Out = Annotated[

@@ -1,13 +1,9 @@
 """`labapp calibrate`: calibration of laser and imaging plane, and a check with known mirrors."""
 
-import typer
-
 from labapp.cli.calibrate import bench, fold, laser, pattern, plane
-from labapp.cli.shared import Commands
+from labapp.cli.shared import command_group
 
-app = typer.Typer(
-    no_args_is_help=True, cls=Commands, help="Calibrate laser or imaging plane, or check both."
-)
+app = command_group()
 app.command("laser")(laser.calibrate_laser)
 app.command("plane")(plane.calibrate_plane)
 app.command("bench")(bench.calibrate_bench)

@@ -23,7 +23,6 @@ from labapp.cli.shared import (
     RECORDING_HELP,
     ROWS_HELP,
     Algorithm,
-    Commands,
     DetectorName,
     ResultsName,
     RowsName,
@@ -32,6 +31,7 @@ from labapp.cli.shared import (
     Warm,
     choose_frames,
     command,
+    command_group,
     finite,
     frames_text,
     measure_frames,
@@ -51,11 +51,7 @@ if TYPE_CHECKING:
     from labapp.session.frames import Progress
     from labapp.session.session import Session
 
-app = typer.Typer(
-    cls=Commands,
-    no_args_is_help=True,
-    help="Keep an experiment in one file: set-up, recording, corrections, results.",
-)
+app = command_group()
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")]
 Frames = Annotated[

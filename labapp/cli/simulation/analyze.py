@@ -9,7 +9,7 @@ import typer
 
 from labapp.cli.shared import (
     NOTHING_MEASURED,
-    Commands,
+    command_group,
     progress_shown,
     results_folder,
     warned,
@@ -33,11 +33,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound=str)
 
-app = typer.Typer(
-    cls=Commands,
-    no_args_is_help=True,
-    help="Reproduce tables and figures of chapters 4, 6 and 8; the error budget of a set-up.",
-)
+app = command_group()
 
 Out = Annotated[
     Path | None,
