@@ -136,9 +136,23 @@ def _steps_to_near_holes(observed: Observation, labels: IntArray) -> list[tuple[
 def with_setups_free(
     observed: Observation, found: list[Hypothesis], fit_settings: FitSettings
 ) -> list[FreeHypothesis]:
-    """Free the set-up of the `MOST_STARTS` cheapest hypotheses that differ in most labels.
+    """Free the set-up of the cheapest hypotheses that differ in most labels, `MOST_STARTS` at most.
 
     With a wrong set-up the correct labels may cost more than others.
+
+    Parameters
+    ----------
+    observed
+        The dots, and the bench with its uncertainty.
+    found
+        Hypotheses for the set-up as entered, at least one.
+    fit_settings
+        Fit settings of the evaluation.
+
+    Returns
+    -------
+    list
+        In ascending order of the cost with the set-up as entered.
     """
     distinct: list[Hypothesis] = []
     for each in sorted(found, key=lambda hypothesis: hypothesis.cost):
@@ -152,7 +166,19 @@ def shifted_to_holes(
 ) -> list[FreeHypothesis]:
     """Free the set-up of labels shifted so that the marker is in each hole between labelled rays.
 
-    The labels themselves come first.
+    Parameters
+    ----------
+    observed
+        The dots, and the bench with its uncertainty.
+    labels
+        Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
+    fit_settings
+        Fit settings of the evaluation.
+
+    Returns
+    -------
+    list
+        The labels themselves, then the shifted ones; those without a surface are omitted.
     """
     steps = [(0, 0), *_steps_to_holes(observed, labels)]
     shifted = (evaluate(observed, shifted_by(observed, labels, step)) for step in steps)
