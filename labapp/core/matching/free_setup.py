@@ -64,6 +64,8 @@ class FreeHypothesis:
         The dots with that set-up; None without a surface.
     gain
         How much less the cost is than with the set-up as entered.
+    marker_cost
+        Part of the cost for a dot at the marker's absent ray.
     """
 
     labels: IntArray
@@ -71,6 +73,7 @@ class FreeHypothesis:
     cost: float = np.inf
     observed: Observation | None = None
     gain: float = 0.0
+    marker_cost: float = 0.0
 
     @property
     def with_likelier_setup(self) -> Observation | None:
@@ -227,7 +230,9 @@ def with_setup_free(
     if grown and grown.cost + setup_cost < cost:
         labels, cost = grown.labels, grown.cost + setup_cost
     gain = 0.0 if likeliest is observed else entered.cost - cost
-    return FreeHypothesis(labels, cost=cost, observed=likeliest, gain=gain)
+    freed = evaluate_averaged(likeliest, labels, fit_settings, pool)
+    marker_cost = freed.cost - freed.cost_without_marker if freed else 0.0
+    return FreeHypothesis(labels, (0, 0), cost, likeliest, gain, marker_cost)
 
 
 def _with_likeliest_setup(

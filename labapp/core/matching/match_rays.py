@@ -278,12 +278,13 @@ def _decide_with_other_setup(
         return None
     most = settings.margin / DOUBTFUL_SHARE
     holes = holes_left_open(observed, entered, USUAL_FIT, most) or rivals
-    least = min(free.cost for free in tried)
-    close = [
-        (free.labels, free.cost - least)
-        for free in tried
-        if free.cost < least + most and not mostly_equal(best.labels, free.labels)
-    ]
+    close, least = [], min(free.cost for free in tried)
+    for free in tried:
+        excess = free.cost - least
+        if excess - free.marker_cost < settings.margin:  # a dot at the absent ray may be false
+            excess -= free.marker_cost
+        if excess < most and not mostly_equal(best.labels, free.labels):
+            close.append((free.labels, excess))
     holes = with_rivals(observed, holes, best.labels, close)
     best = replace(entered, witness=best.witness, missed_rays=best.missed_rays)
     return best, [replace(each, cost=DOUBTFUL_SHARE * each.cost) for each in holes]
