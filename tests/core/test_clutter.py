@@ -131,6 +131,14 @@ def test_rows_three_away_are_rivals_if_the_setup_is_in_doubt() -> None:
 
 
 @pytest.mark.slow
+def test_false_dot_at_the_absent_ray_does_not_exclude_the_right_rows() -> None:
+    """Every label was wrong: without that dot the right rows cost as little as the wrong ones."""
+    rig, seen, pool = draw("egg", 8207, 0.05, 12)
+    got = measure_pool(pool, seen, with_setup_errors(rig, 8207, 1.0))
+    assert got.status == "ambiguous-rows"
+
+
+@pytest.mark.slow
 def test_labels_that_hardly_fit_do_not_prevent_a_result() -> None:
     """For one hypothesis the normal matrix of the set-up is numerically singular."""
     clutter = clutter_recordings.Clutter(missing=0.05)
