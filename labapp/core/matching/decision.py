@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open
+from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open, unconfirmed
 from labapp.core.matching.hypothesis import (
     FINE_FIT,
     KNOT_ERROR_MM,
@@ -110,7 +110,10 @@ def decide(
             rivals.append((other.labels, _excess(other, cheapest)))
     best = _without(observed, best, doubtful, fit_settings)
     best = supported(observed, best, fit_settings)
-    open_holes = holes_left_open(observed, best, fit_settings, settings.margin)
+    freed = holes_left_open(observed, best, fit_settings, settings.margin)
+    if freed:
+        best = _without(observed, best, unconfirmed(freed[0], best.labels), fit_settings)
+    open_holes = freed if len(freed) > 1 else []
     return best, with_rivals(observed, open_holes, best.labels, rivals)
 
 

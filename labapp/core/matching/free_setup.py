@@ -87,12 +87,12 @@ class FreeHypothesis:
 def holes_left_open(
     observed: Observation, best: Hypothesis, fit_settings: FitSettings, margin: float
 ) -> list[FreeHypothesis]:
-    """Hypotheses for each hole that may be the marker's, with a free set-up.
+    """A hypothesis with a free set-up, and those for other holes that may be the marker's.
 
     Labels are those of the hypothesis, and those shifted by up to two rows or columns whose cost is
     higher by less than a margin; if the set-up is in doubt, also those with the marker in any hole
     between labelled rays. Shifts that place a dot at the marker's absent ray are omitted, as no
-    set-up explains it. If the rig is known exactly, there are none.
+    set-up explains it.
 
     Parameters
     ----------
@@ -108,10 +108,11 @@ def holes_left_open(
     Returns
     -------
     list
-        The hypothesis itself first, then its rivals; empty if it has none.
+        The hypothesis itself first, then its rivals; empty if the rig is known exactly, or the
+        hypothesis explains every dot and leaves no hole.
     """
     near, far = _steps_to_near_holes(observed, best.labels), _steps_to_holes(observed, best.labels)
-    if observed.rig.uncertainty is None or not (near or far):
+    if observed.rig.uncertainty is None or not (near or far or best.stray_count):
         return []
     own = with_setup_free(observed, best, fit_settings)
     steps, most = near, own.cost + margin
@@ -125,7 +126,22 @@ def holes_left_open(
             rival = with_setup_free(observed, shifted, fit_settings, most)
             if rival.cost < own.cost + margin:
                 rivals.append(replace(rival, step=step))
-    return [own, *rivals] if rivals else []
+    return [own, *rivals]
+
+
+def unconfirmed(free: FreeHypothesis, labels: IntArray) -> IntArray:
+    """Dots that lose or change their ray with the likeliest set-up, if that as entered is in doubt.
+
+    Parameters
+    ----------
+    free
+        The hypothesis with a free set-up.
+    labels
+        Its labels with the set-up as entered, shape (rows, columns).
+    """
+    if free.with_likelier_setup is None:
+        return np.zeros(0, np.int64)
+    return np.asarray(labels[(labels != UNLABELLED) & (labels != free.labels)])
 
 
 def _steps_to_near_holes(observed: Observation, labels: IntArray) -> list[tuple[int, int]]:

@@ -277,7 +277,8 @@ def _decide_with_other_setup(
     if entered is None:
         return None
     most = settings.margin / DOUBTFUL_SHARE
-    holes = holes_left_open(observed, entered, USUAL_FIT, most) or rivals
+    freed = holes_left_open(observed, entered, USUAL_FIT, most)
+    holes = freed if len(freed) > 1 else rivals
     close, least = [], min(free.cost for free in tried)
     for free in tried:
         excess = free.cost - least
