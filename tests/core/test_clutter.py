@@ -139,6 +139,16 @@ def test_false_dot_at_the_absent_ray_does_not_exclude_the_right_rows() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("kind", "seed"), [("ellipse", 8201), ("concave", 8207)])
+def test_labels_that_the_likeliest_setup_does_not_confirm_are_removed(kind: str, seed: int) -> None:
+    """Two dots at the rim had the rays of others."""
+    rig, seen, pool = draw(kind, seed, 0.05, 12)
+    got = measure_pool(pool, seen, with_setup_errors(rig, seed, 1.0))
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.9 * got.shown
+
+
+@pytest.mark.slow
 def test_labels_that_hardly_fit_do_not_prevent_a_result() -> None:
     """For one hypothesis the normal matrix of the set-up is numerically singular."""
     clutter = clutter_recordings.Clutter(missing=0.05)
