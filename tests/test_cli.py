@@ -939,7 +939,11 @@ def test_version_is_printed(labapp: Run) -> None:
 @pytest.mark.parametrize(
     ("start", "heavy"),
     [
-        ("import labapp.cli", {"numpy", "rich", "pyvista", "filelock", "labapp.cli.session"}),
+        (
+            "import labapp.cli",
+            {"numpy", "scipy", "cv2", "rich", "pyvista", "matplotlib"}
+            | {"filelock", "importlib.metadata", "labapp.cli.session"},
+        ),
         (
             "from labapp import Session",
             {"scipy", "cv2", "av", "numba", "h5py", "matplotlib", "labapp.core.pipeline"},

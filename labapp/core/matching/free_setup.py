@@ -248,7 +248,7 @@ def with_setup_free(
     gain = 0.0 if likeliest is observed else entered.cost - cost
     freed = evaluate_averaged(likeliest, labels, fit_settings, pool)
     marker_cost = freed.cost - freed.cost_without_marker if freed else 0.0
-    return FreeHypothesis(labels, (0, 0), cost, likeliest, gain, marker_cost)
+    return FreeHypothesis(labels, cost=cost, observed=likeliest, gain=gain, marker_cost=marker_cost)
 
 
 def _with_likeliest_setup(
