@@ -20,7 +20,9 @@ import numpy as np
 from labapp.core.geometry.bench import Bench
 from labapp.core.match import MatchedDots
 from labapp.core.matching.hypothesis import (
+    MISSED_COST,
     SHIFTS,
+    STRAY_COST,
     USUAL_FIT,
     Hypothesis,
     evaluate,
@@ -50,6 +52,10 @@ SETUP_GAIN = 80.0
 """If another set-up lowers the cost of a hypothesis by more, the one as entered is in doubt. With
 the true one, cluttered frames gained less than 40; with errors of one standard uncertainty, most
 gained hundreds."""
+
+LEAST_COST = SETUP_GAIN / 2
+"""A hypothesis whose surface and labelled dots cost less does not gain `SETUP_GAIN`: of 80 frames
+that gained so much, none cost less than 56. With the true set-up most cost 10 to 40."""
 
 
 @dataclass(frozen=True)
@@ -112,11 +118,15 @@ def holes_left_open(
     Returns
     -------
     list
-        The hypothesis itself first, then its rivals; empty if the rig is known exactly, or the
-        hypothesis explains every dot and leaves no hole.
+        The hypothesis itself first, then its rivals; empty if the rig is known exactly, the
+        hypothesis explains every dot and leaves no hole, or no hole is near and its labelled dots
+        put the set-up beyond doubt.
     """
     near, far = _steps_to_near_holes(observed, best.labels), _steps_to_holes(observed, best.labels)
     if observed.rig.uncertainty is None or not (near or far or best.stray_count):
+        return []
+    unexplained = STRAY_COST * best.stray_count + MISSED_COST * best.missed_count
+    if not near and best.cost - unexplained < LEAST_COST:
         return []
     own = with_setup_free(observed, best, fit_settings, grow=bool(near))
     steps, most = near, own.cost + margin

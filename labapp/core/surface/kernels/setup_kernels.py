@@ -55,24 +55,26 @@ def coefficient_changes(
     lasers, planes, rays, moved_dots = moved
     base = gradient_rhs(grid, coefficients, points, weights, laser, plane, dots)
     changes = np.zeros((len(lasers), len(coefficients)))
-    start, rises = np.empty_like(points), np.empty_like(points)
+    there, rises, right = np.empty_like(rays), np.empty_like(rays), np.empty_like(changes)
+    start = np.empty_like(points)
     for k in range(len(lasers)):
         for n in range(len(points)):
             along = (points[n, 2] - lasers[k, 2]) / rays[k, n, 2]
             start[n] = lasers[k] + along * rays[k, n]
-        there, _ = newton_along_rays(grid, coefficients, rays[k], start, NEWTON_STEPS)
-        _, slope_x, slope_y = surface_at(grid, coefficients, there)
+        there[k], _ = newton_along_rays(grid, coefficients, rays[k], start, NEWTON_STEPS)
+        _, slope_x, slope_y = surface_at(grid, coefficients, there[k])
         for n in range(len(points)):
             x, y, z = rays[k, n]
-            rises[n] = rays[k, n] / (z - slope_x[n] * x - slope_y[n] * y)
-        seen = lasers[k], planes[k], moved_dots[k]
-        for _ in range(rounds):
-            raised = surface_at(grid, changes[k], there)[0].copy().reshape(-1, 1)
-            at = there + raised * rises
-            asked = gradient_rhs(grid, coefficients, at, weights, *seen)
-            change = solve(lower, (asked - base).reshape(1, -1))[0]
-            # Slopes do not determine the level.
-            changes[k] = change - surface_at(grid, change, there)[0].mean()
+            rises[k, n] = rays[k, n] / (z - slope_x[n] * x - slope_y[n] * y)
+    for _ in range(rounds):
+        for k in range(len(lasers)):
+            raised = surface_at(grid, changes[k], there[k])[0].copy().reshape(-1, 1)
+            at = there[k] + raised * rises[k]
+            seen = lasers[k], planes[k], moved_dots[k]
+            right[k] = gradient_rhs(grid, coefficients, at, weights, *seen) - base
+        changes = solve(lower, right)
+        for k in range(len(lasers)):  # slopes do not determine the level
+            changes[k] -= surface_at(grid, changes[k], there[k])[0].mean()
     return changes
 
 

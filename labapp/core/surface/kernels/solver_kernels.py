@@ -163,10 +163,28 @@ def _solve(columns: FloatArray, right: FloatArray) -> None:
 @_compiled(BAND, FLOATS_2)
 def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
     """Solve the normal equations of a factor for m right-hand sides, shape (m, p)."""
-    made = right.copy()
-    for m in range(len(made)):
-        _solve(lower.T, made[m])
-    return made
+    columns = lower.T
+    count, height = columns.shape
+    if len(right) == 1:
+        made = right.copy()
+        _solve(columns, made[0])
+        return made
+    solved = right.T.copy()  # the innermost loops are over the right-hand sides
+    for j in range(count):
+        own = solved[j]
+        own /= columns[j, 0]
+        for k in range(1, min(height, count - j)):
+            factor, other = columns[j, k], solved[j + k]
+            for m in range(len(own)):
+                other[m] -= factor * own[m]
+    for j in range(count - 1, -1, -1):
+        own = solved[j]
+        for k in range(1, min(height, count - j)):
+            factor, other = columns[j, k], solved[j + k]
+            for m in range(len(own)):
+                own[m] -= factor * other[m]
+        own /= columns[j, 0]
+    return solved.T.copy()
 
 
 @_compiled(BAND)
