@@ -7,7 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 import scipy
 
-from labapp.core.matching.hypothesis import FINE_FIT, Hypothesis, grow_and_evaluate
+from labapp.core.matching.hypothesis import (
+    FINE_FIT,
+    KNOT_ERROR_MM,
+    Hypothesis,
+    grow_and_evaluate,
+)
 from labapp.core.matching.observation import UNLABELLED, Observation, widened, within_rings
 from labapp.core.matching.prediction import (
     GATE_SIGMA2,
@@ -52,7 +57,8 @@ def with_repaired(
 
     Where rows cross in a dip, growth may swap them; the swapped labels then bend the surface and
     support each other. The surface through the surrounding labels is more reliable, and follows
-    the dip with finer knots.
+    the dip with finer knots. These are not needed where the usual ones fit and the discarded labels
+    are found again.
     """
     found = found + new
     best = min(found, key=lambda hypothesis: hypothesis.misfit, default=None)
@@ -66,6 +72,8 @@ def with_repaired(
             # Dots of swapped rows usually leave missed rays, too; false dots leave none.
             tried, finer = [labels, *tried], [labels, *finer] if best.missed_count else finer
         grown = [grow_and_evaluate(observed, labels) for labels in tried]
+        if best.residual_rms_mm <= KNOT_ERROR_MM and _found_again(best, grown):
+            finer = []
         knot_mm = FINE_FIT.knot_mm
         grown += [grow_and_evaluate(observed, labels, knot_mm=knot_mm) for labels in finer]
         repaired = [hypothesis for hypothesis in grown if hypothesis is not None]
@@ -73,6 +81,11 @@ def with_repaired(
         best = cheapest if cheapest.misfit < best.misfit else None
         found = found if best is None else [*found, best]
     return found
+
+
+def _found_again(hypothesis: Hypothesis, grown: list[Hypothesis | None]) -> bool:
+    """Whether any of the grown hypotheses has the same labels as another."""
+    return any(each is not None and (each.labels == hypothesis.labels).all() for each in grown)
 
 
 def _closed_up(hypothesis: Hypothesis) -> Iterator[IntArray]:
