@@ -21,7 +21,17 @@ COMPILED = (
     "labapp.core.rows.lattice_kernels",
     *(
         f"labapp.core.surface.kernels.{name}_kernels"
-        for name in ("spline", "ray", "solver", "boundary", "level", "rounds", "setup", "shape")
+        for name in (
+            "spline",
+            "ray",
+            "solver",
+            "boundary",
+            "level",
+            "rounds",
+            "fit",
+            "setup",
+            "shape",
+        )
     ),
     "labapp.core.matching.match_kernels",
     "labapp.core.matching.initial.quadric_kernels",

@@ -27,7 +27,7 @@ from labapp.core.matching.hypothesis import (
     without_false_ends,
 )
 from labapp.core.matching.match_settings import MatchSettings
-from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try_fit
+from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
 from labapp.core.matching.unexplained import MOST_SCATTERED, any_explains, refuse_unexplained
@@ -345,20 +345,18 @@ def _rivals(
     comparable too. (Fine knots are used for a dip, which the rough fit does not follow.)
     """
     most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_rms_mm)
-    quick = try_fit(observed, best.labels, QUICK, best.pool)
+    labelled = [best.labels, *labelled]
+    quick_mm = observed.quick_misfits(labelled, best.pool)
+    far_mm = QUICK_MISFIT_TIMES * quick_mm[0]
     rough = try_fit(observed, best.labels, initial=best.pool)
-    far_mm = np.inf if quick is None else QUICK_MISFIT_TIMES * quick.residual_rms_mm
     costs = (
         None
         if rough is None or fit_settings == FINE_FIT
         else rough_costs(observed, best.labels, rough)
     )
     rivals = []
-    for labels in labelled:
-        sketch = try_fit(observed, labels, QUICK, best.pool)
-        if sketch is None or sketch.residual_rms_mm > far_mm:
-            continue
-        pool = try_fit(observed, labels, initial=best.pool)
+    for labels, off_mm in zip(labelled[1:], quick_mm[1:], strict=True):
+        pool = None if off_mm > far_mm else try_fit(observed, labels, initial=best.pool)
         if pool is None or pool.residual_rms_mm >= most_mm:
             continue
         if costs is not None:

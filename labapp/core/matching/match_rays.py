@@ -65,8 +65,6 @@ from labapp.core.matching.initial.quadrics import search_quadrics
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import (
     LEAST_LABELS,
-    QUICK,
-    SOFT,
     UNLABELLED,
     Observation,
     try_fit,
@@ -83,7 +81,6 @@ from labapp.core.matching.unexplained import (
     suffices,
 )
 from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_dots
-from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
@@ -339,19 +336,18 @@ def _by_sites(
         labels_from_lattice(lattice, site, pattern.marker, orientation, shape)
         for site, orientation in product(sites, orientations)
     ]
-    quick = _fitting(observed, labelled, QUICK)[: 2 * MOST_SITES]
-    labelled = [labels for off_mm, labels in quick if off_mm <= QUICK_MISFIT_TIMES * quick[0][0]]
-    rough = _fitting(observed, labelled, SOFT)[:MOST_SITES]
+    quick_mm = observed.quick_misfits(labelled)
+    far_mm = QUICK_MISFIT_TIMES * quick_mm.min(initial=np.inf)
+    likely = np.argsort(quick_mm, kind="stable")[: 2 * MOST_SITES]
+    rough = _fitting(observed, [labelled[k] for k in likely if quick_mm[k] <= far_mm])[:MOST_SITES]
     most_mm = max(MISFIT_MM, MISFIT_TIMES * rough[0][0]) if rough else 0.0
     scored = (grow_and_evaluate(observed, labels) for off_mm, labels in rough if off_mm < most_mm)
     return [hypothesis for hypothesis in scored if hypothesis is not None]
 
 
-def _fitting(
-    observed: Observation, labelled: list[IntArray], settings: FitSettings
-) -> list[tuple[float, IntArray]]:
+def _fitting(observed: Observation, labelled: list[IntArray]) -> list[tuple[float, IntArray]]:
     """Labels with the root mean square residual of their fit, mm, in ascending order."""
-    pools = ((try_fit(observed, labels, settings), labels) for labels in labelled)
+    pools = ((try_fit(observed, labels), labels) for labels in labelled)
     found = [(pool.residual_rms_mm, labels) for pool, labels in pools if pool is not None]
     return sorted(found, key=lambda one: one[0])
 

@@ -6,6 +6,7 @@ ray's dot, and masks, such as the rays that are *lit* because they have a dot.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -19,7 +20,7 @@ from labapp.core.geometry.optics import ProjectedRays
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import MatchedDots
-from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
+from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool, misfits
 from labapp.core.values import (
     BoolArray,
     CannotMeasure,
@@ -57,7 +58,8 @@ surface. The stiffer surface extrapolates a shallow pool farther; a steep pool n
 """
 
 QUICK = replace(SOFT, knot_mm=1.5, rounds=3)
-"""Fit settings for ranking many sets of labels: the correct one is near the top of the ranking."""
+"""Fit settings for ranking many sets of labels (`Observation.quick_misfits`): the correct one is
+near the top of the ranking."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,20 @@ class Observation(ReadOnlyArrays):
         if isinstance(found, tuple):
             raise CannotMeasure(*found)
         return found
+
+    def quick_misfits(
+        self, labelled: Sequence[IntArray], initial: FittedPool | None = None
+    ) -> FloatArray:
+        """Root mean square residuals of quick fits to k sets of labels, shape (k,), mm.
+
+        The level is guessed. A residual is infinite if there are fewer than `LEAST_LABELS`, or no
+        surface fits them. Parameters are those of `fit`.
+        """
+        if not labelled:
+            return np.zeros(0)
+        near = None if initial is None else initial.surface
+        sets, dots = np.array(labelled), (self.plane_mm, self.covariance_mm2)
+        return misfits(sets, *dots, self.rig, QUICK, near, least=LEAST_LABELS)
 
     def _forget_oldest(self) -> None:
         """Drop the oldest fits from the cache while all factors exceed `KEPT_BYTES`."""

@@ -33,8 +33,8 @@ from labapp.core.surface.solver import (
     mean_splines,
     propagate_sigma,
 )
-from labapp.core.surface.spline import SplineBasis, SplineSurface
-from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
+from labapp.core.surface.spline import SplineBasis, SplineSurface, cell_products
+from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 MARGIN_ROWS, LEAST_MARGIN_MM = 2.5, 2.0
 """Margin of the splines beyond the outermost reflection points, in rows of rays, and its minimum,
@@ -187,6 +187,53 @@ def fit_pool(
     return fitted_pool(rounds, level, rig, match.plane_mm)
 
 
+def misfits(
+    labelled: IntArray,
+    plane_mm: FloatArray,
+    plane_covariance_mm2: FloatArray,
+    rig: Rig,
+    settings: FitSettings,
+    initial: SplineSurface | None = None,
+    *,
+    least: int,
+) -> FloatArray:
+    """Residuals of fits to many sets of labels, in less time than with `fit_pool`.
+
+    Parameters
+    ----------
+    labelled
+        For each set, the index of each ray's dot, negative if it has none, shape (k, rows,
+        columns).
+    plane_mm, plane_covariance_mm2
+        The n dots on the plane, shape (n, 2), mm, and their covariance, shape (n, 2, 2), mm².
+    rig, settings, initial
+        See `fit_pool`. The level is guessed.
+    least
+        Minimum number of labelled dots.
+
+    Returns
+    -------
+    FloatArray
+        Root mean square distance of computed from captured dots, shape (k,), mm; infinite if a set
+        has too few labels or no surface can be fitted.
+    """
+    from labapp.core.surface.kernels import fit_kernels
+
+    rays, flat = project_rays(rig.laser, rig.pattern), (np.empty((2, 4)), np.empty(0))
+    weight, reuse_mm = _roughness_weight(settings), REUSE_FLOORS * settings.floor_mm
+    fit = MOST_SPLINES, _margin_mm(rays), settings.knot_mm, weight, settings.floor_mm
+    rounds = settings.rounds, settings.settled_mm, NEWTON_STEPS, reuse_mm
+    return fit_kernels.misfits(
+        labelled,
+        (rays.directions, rays.landing_mm),
+        (plane_mm, plane_covariance_mm2),
+        (rig.laser.position_mm, rig.imaging_plane.pose_mm),
+        flat if initial is None else (initial.basis.grid, initial.coefficients),
+        cell_products(),
+        np.array([least, *fit, *rounds], float),
+    )
+
+
 def normal_equations(
     basis: SplineBasis,
     rig: Rig,
@@ -206,7 +253,7 @@ def normal_equations(
     weights = ray_kernels.slope_weights(
         laser, plane, points_mm, dots, plane_covariance_mm2, settings.floor_mm
     )
-    stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness_matrix
+    stiffness = _roughness_weight(settings) * basis.roughness_matrix
     return NormalEquations(basis, stiffness, laser, plane, dots, weights)
 
 
@@ -251,6 +298,16 @@ def basis_around(places_mm: FloatArray, rays: ProjectedRays, knot_mm: float) -> 
     knot_mm
         Spacing of the spline knots, mm.
     """
-    margin = max(MARGIN_ROWS * rays.spacing_mm.max(), LEAST_MARGIN_MM)
+    margin = _margin_mm(rays)
     low, high = places_mm.min(axis=0) - margin, places_mm.max(axis=0) + margin
     return SplineBasis.over(low, high, knot_mm)
+
+
+def _margin_mm(rays: ProjectedRays) -> float:
+    """Margin of the splines beyond the outermost reflection points, mm."""
+    return max(MARGIN_ROWS * float(rays.spacing_mm.max()), LEAST_MARGIN_MM)
+
+
+def _roughness_weight(settings: FitSettings) -> float:
+    """Weight of the roughness of a surface, mm⁶."""
+    return CORRELATED_MM2 / settings.jerk**2

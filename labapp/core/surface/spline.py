@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -71,31 +71,25 @@ def _values_and_slopes(*step_mm: float) -> FloatArray:
     return pieces
 
 
-@lru_cache(maxsize=256)
-def _products(count: int) -> FloatArray:
-    """Integrals of products of the derivatives, of order 0 … 3, of splines along an axis.
+@cache
+def cell_products() -> FloatArray:
+    """Integrals over a cell of size 1 of products of its four splines, and of their derivatives.
 
-    For cells of size 1, and for each spline with itself and the next three, shape (4, count, 4).
+    For the orders 0 … 3 of the derivatives, shape (4, 4, 4).
     """
     node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
-    power = ((node + 1) / 2)[:, None] ** np.arange(DEGREE + 1)
-    products = np.zeros((DEGREE + 1, count, DEGREE + 1))
-    for order, pieces in enumerate(_PIECES):
-        part = power @ pieces
-        within = (part * (weight / 2)[:, None]).T @ part
-        for one in range(DEGREE + 1):
-            for on in range(DEGREE + 1 - one):
-                products[order, one : count - DEGREE + one, on] += within[one, one + on]
+    parts = (((node + 1) / 2)[:, None] ** np.arange(DEGREE + 1)) @ np.stack(_PIECES)
+    products = np.swapaxes(parts * (weight / 2)[:, None], 1, 2) @ parts
     products.flags.writeable = False
-    return products
+    return np.asarray(products)
 
 
 @lru_cache(maxsize=16)
-def _roughness_matrix(x_count: int, y_count: int, *step_mm: float) -> FloatArray:
+def _roughness_matrix(*grid: tuple[float, ...]) -> FloatArray:
     """`SplineBasis.roughness_matrix`; not kept by the basis, of which a hard frame has hundreds."""
     from labapp.core.surface.kernels import solver_kernels
 
-    band = solver_kernels.roughness_band(_products(x_count), _products(y_count), np.array(step_mm))
+    band = solver_kernels.roughness_band(cell_products(), np.array(grid))
     band.flags.writeable = False
     return np.asarray(band)
 
@@ -195,7 +189,7 @@ class SplineBasis(ReadOnlyArrays):
 
         Lower band, shape (width + 1, splines), in LAPACK's storage.
         """
-        return _roughness_matrix(*self.shape, *self.step_mm.tolist())
+        return _roughness_matrix(*map(tuple, self.grid.tolist()))
 
     def roughness_products(self, coefficients: FloatArray) -> FloatArray:
         """Products Pc of the matrix with coefficients, shape (splines,) or (splines, m)."""

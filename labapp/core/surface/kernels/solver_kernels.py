@@ -29,14 +29,32 @@ AT_ONCE = 8
 """Columns of a matrix that are factorized at once."""
 
 
-@_compiled(FLOATS_3, FLOATS_3, FLOATS_1)
-def roughness_band(along_x: FloatArray, along_y: FloatArray, step: FloatArray) -> FloatArray:
-    """Band of `SplineBasis.roughness_matrix` from products along x and along y in cells of size 1.
+@_inner
+def _products_along(products: FloatArray, cells: int) -> FloatArray:
+    """Products of each spline along an axis with itself and the next three, for each order.
 
-    Those of each spline with itself and the next three, for orders 0 … 3, shapes (4, nx, 4) and
-    (4, ny, 4) (`spline._products`); the size of a cell has shape (2,), mm.
+    The arguments are those of `roughness_band` and the number of cells along the axis; shape
+    (4, cells + 3, 4).
     """
-    nx, ny = along_x.shape[1], along_y.shape[1]
+    along = np.zeros((4, cells + 3, 4))
+    for order in range(4):
+        for one in range(4):
+            for on in range(4 - one):
+                for cell in range(cells):
+                    along[order, cell + one, on] += products[order, one, one + on]
+    return along
+
+
+@_compiled(FLOATS_3, FLOATS_2)
+def roughness_band(products: FloatArray, grid: FloatArray) -> FloatArray:
+    """Band of `SplineBasis.roughness_matrix`.
+
+    ``products`` are the integrals over a cell of size 1 of products of the four splines there, or
+    of their derivatives of orders 0 … 3, shape (4, 4, 4).
+    """
+    x_cells, y_cells, step = int(grid[0, 3]), int(grid[1, 3]), grid[:, 2]
+    along_x, along_y = _products_along(products, x_cells), _products_along(products, y_cells)
+    nx, ny = x_cells + 3, y_cells + 3
     columns = np.zeros((nx * ny, 3 * (ny + 1) + 1))
     scale = np.empty(4)
     for order in range(4):
