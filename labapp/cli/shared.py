@@ -96,8 +96,20 @@ KINDS_OF_VALUE = {
 }
 
 
+def reject_empty_path(parameter: Any, ctx: Any, value: Any) -> None:
+    """Raise `typer.BadParameter` for an empty path, which would mean the current folder."""
+    given = value if isinstance(value, list | tuple) else [value]
+    if parameter.type_descriptor.annotation is Path and "" in given:
+        raise typer.BadParameter("the path is empty; . is the current folder", ctx, parameter)
+
+
 class Argument(typer.core.TyperArgument):
     """Argument that the help names in capitals, without its type."""
+
+    def process_value(self, ctx: Any, value: Any) -> Any:
+        """Convert the text of the command line."""
+        reject_empty_path(self, ctx, value)
+        return super().process_value(ctx, value)
 
     @property
     def display_name_raw(self) -> str:
@@ -117,6 +129,11 @@ class Argument(typer.core.TyperArgument):
 
 class Option(typer.core.TyperOption):
     """Option whose kind of value is in capitals, such as NUMBER, or a list of choices."""
+
+    def process_value(self, ctx: Any, value: Any) -> Any:
+        """Convert the text of the command line."""
+        reject_empty_path(self, ctx, value)
+        return super().process_value(ctx, value)
 
     def display_type(self, ctx: Any) -> str:
         """Return the kind of value of an option without ``metavar``."""

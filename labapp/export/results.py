@@ -8,7 +8,7 @@ import json
 import os
 import re
 from collections.abc import Collection, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Self
@@ -131,9 +131,7 @@ class ResultsWriter:
             self._lock.enter_context(only_writer(Path(os.path.realpath(folder))))
             _clear(folder)
             self._write_run()
-            for name in TABLES:
-                self._files[name] = io.FileIO(folder / f"{name}.csv", "a")
-                write_all(self._files[name], as_bytes(csv_header(name, sigma_parts)))
+            self._open_tables()
         except BaseException as error:
             self._close_files()
             if isinstance(error, OSError):
@@ -211,20 +209,32 @@ class ResultsWriter:
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         """Write the final state of the run to `run.json`."""
-        state = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-        self._run |= {
-            "state": state if error else "finished",
-            "ended": now(),
-            "frames_done": self.frames,
-        }
         try:
             try:
-                self._write_run()
+                self._write_state(error)
             finally:
                 self._close_files()
         except OSError as failure:
             if error is None:
                 raise self._unwritable(failure) from failure
+
+    def _open_tables(self) -> None:
+        """Create the tables with their headers."""
+        try:
+            for name in TABLES:
+                self._files[name] = io.FileIO(self.folder / f"{name}.csv", "a")
+                write_all(self._files[name], as_bytes(csv_header(name, self._sigma_parts)))
+        except BaseException as error:
+            with suppress(OSError):
+                self._write_state(error)
+            raise
+
+    def _write_state(self, error: BaseException | None) -> None:
+        """Write the final state of the run, which an error may have ended, to `run.json`."""
+        state = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        state = state if error else "finished"
+        self._run |= {"state": state, "ended": now(), "frames_done": self.frames}
+        self._write_run()
 
     def _write_run(self) -> None:
         text = json.dumps(self._run, indent=2, ensure_ascii=False) + "\n"

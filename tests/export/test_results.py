@@ -338,6 +338,17 @@ def test_failed_frame_leaves_no_rows(
     assert run["state"] == ("interrupted" if expected is KeyboardInterrupt else "failed")
 
 
+def test_run_whose_tables_cannot_be_opened_has_failed(tmp_path: Path, writer: Writer) -> None:
+    with (
+        mock.patch.object(results, "write_all", side_effect=OSError(28, "No space left")),
+        pytest.raises(InputError),
+    ):
+        writer(tmp_path)
+    run = json.loads((tmp_path / "run.json").read_text())
+    assert (run["state"], run["frames_done"]) == ("failed", 0)
+    assert run["ended"] is not None
+
+
 FULL_DISK = """
     import resource, sys
     from labapp.core.geometry.coordinates import ImageCalibration
