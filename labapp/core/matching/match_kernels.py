@@ -266,32 +266,26 @@ def classify_rays(
     seen = within_view(shown, np.zeros_like(shown), view[0], view[1], view[2]) & ~blocked
 
     among = np.flatnonzero(amid_lit[known] & ~dotless[known])
-    merged = next_apart(shown[among]) < resolution
-    is_missed = seen[among] & ~merged & ~lit[known[among]]
-    missed = known[among[is_missed]]
+    unlit = among[seen[among] & ~lit[known[among]]]
+    apart = two_nearest(shown[unlit], shown[among])[0][:, 1]
+    missed = known[unlit[apart >= resolution]]
     unlabelled = np.ones(len(dots), np.bool_)
     for label in labels.ravel():
         if label >= 0:
             unlabelled[label] = False
     stray = np.flatnonzero(unlabelled)
     candidates = dots[stray]
-    around = np.flatnonzero(widened(amid(is_lit), 1).ravel()[known] & ~dotless[known])
-    around = around[next_apart(shown[around]) < resolution]
-    if len(stray) and len(around):
-        apart = two_nearest(candidates, shown[around])[0][:, 0] > resolution
-        stray = stray[apart]
+    if len(stray):
+        around = np.flatnonzero(widened(amid(is_lit), 1).ravel()[known] & ~dotless[known])
+        around = around[next_apart(shown[around]) < resolution]
+        stray = stray[two_nearest(candidates, shown[around])[0][:, 0] > resolution]
 
-    spacing = next_apart(shown)
     witness = np.zeros(len(plane), np.int64)
+    unlit = np.flatnonzero(seen & ~(amid_lit | dotless)[known])
+    spacing = next_apart(shown)[unlit]
     # A stray dot near a prediction may be the dot of a ray that seems dark.
-    away = np.full(len(known), np.inf)
-    if len(candidates):
-        away = two_nearest(shown, candidates)[0][:, 0]
-    for k in range(len(known)):
-        ray = known[k]
-        may_be_lit = amid_lit[ray] or dotless[ray] or away[k] < spacing[k]
-        if seen[k] and spacing[k] >= resolution and not may_be_lit:
-            witness[ray] = -1
+    away = two_nearest(shown[unlit], candidates)[0][:, 0]
+    witness[known[unlit[(spacing >= resolution) & (away >= spacing)]]] = -1
     witness[lit] = 1
     return witness, missed, stray
 
