@@ -252,7 +252,7 @@ def upsampled_peaks(
         Columns and rows, shape (2, n), and the upsampled band there, shape (n,).
     """
     over = _pixels_over(band, low)
-    number = np.full(band.shape, -1, np.int32)
+    number = np.full(band.shape, -1)
     fours, patch = np.empty((len(over), 4), np.float32), np.empty((7, 7), np.float32)
     # Lagrange's polynomials through six pixels.
     taps = np.array([77, -693, 6930, 2310, -495, 63], np.float32) / np.float32(8192)
