@@ -285,38 +285,41 @@ class WarmMeasurer:
             yield from _with_rows_voted(stretch, self.setup, self.settings, warm=True)
 
     def _stretch(self, frames: Iterable[int]) -> Generator[FrameResult]:
+        warm, place = self._chain(), 0
         last: int | None = None
         step: int | None = None
-        for place, (number, frame) in enumerate(self._read_ahead(frames)):
-            if place in BY_THEMSELVES:
-                warm = self._chain()
-            before = None if last is None else number - last
-            if step is not None and before != step:
-                warm.skip()
-            last, step = number, before
-            if isinstance(frame, FrameResult):
-                warm.skip()
-                yield frame
-            elif (correction := self.corrected(number)) is not None:
-                warm.skip()
-                yield _cold(number, frame, self.setup, self.settings, correction)
-            else:
-                with _one_thread():
-                    found = warm.measure(frame.image)
-                yield FrameResult(number, frame.time_s, found, warm.track_lost)
+        for read in self._read_ahead(frames):
+            warm.look_ahead(frame.image for _, frame in read if isinstance(frame, Frame))
+            for number, frame in read:
+                if place in BY_THEMSELVES:
+                    warm = self._chain()
+                before = None if last is None else number - last
+                if step is not None and before != step:
+                    warm.skip()
+                place, last, step = place + 1, number, before
+                if isinstance(frame, FrameResult):
+                    warm.skip()
+                    yield frame
+                elif (correction := self.corrected(number)) is not None:
+                    warm.skip()
+                    yield _cold(number, frame, self.setup, self.settings, correction)
+                else:
+                    with _one_thread():
+                        found = warm.measure(frame.image)
+                    yield FrameResult(number, frame.time_s, found, warm.track_lost)
 
-    def _read_ahead(self, frames: Iterable[int]) -> Iterator[tuple[int, Frame | FrameResult]]:
-        """Yield numbers and frames (`_read`), some of which are read at once, see `_next_batch`."""
+    def _read_ahead(self, frames: Iterable[int]) -> Iterator[list[tuple[int, Frame | FrameResult]]]:
+        """Yield numbers and frames (`_read`), some at once, see `_next_batch`."""
         numbers = iter(frames)
         while chosen := list(islice(numbers, READ_AT_ONCE)):
-            ahead: list[tuple[int, Frame | FrameResult]] = []
+            read: list[tuple[int, Frame | FrameResult]] = []
             try:
                 for number in chosen:
-                    ahead.append((number, _read(self.read, number, self.setup, self.settings)))
+                    read.append((number, _read(self.read, number, self.setup, self.settings)))
             except InputError:  # after the frames before it
-                yield from ahead
+                yield read
                 raise
-            yield from ahead
+            yield read
 
     def _chain(self) -> WarmChain | _ChainElsewhere:
         from labapp.core.recording.chain import WarmChain
@@ -333,6 +336,9 @@ class _ChainElsewhere:
         self.track_lost: str | None = None
         self._pool = pool
         pool.submit(hold, _new_chain, setup, settings)
+
+    def look_ahead(self, images: Iterable[GreyImage]) -> None:
+        """Do nothing, as each frame is passed by itself."""
 
     def skip(self) -> None:
         """Skip a frame."""
