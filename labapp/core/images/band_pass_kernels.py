@@ -84,14 +84,15 @@ def next_apart(places: FloatArray) -> FloatArray:
     """Distance of each place, shape (n, 2), to the nearest other, shape (n,); infinite if n = 1."""
     count = len(places)
     x, y, least = places[:, 0].copy(), places[:, 1].copy(), np.full(count, np.inf)
-    for k in range(count):
-        own_x, own_y = x[k], y[k]
-        for first, last in ((0, k), (k + 1, count)):
-            to_x, to_y, next_one = x[first:last], y[first:last], least[first:last]
-            for m in range(len(next_one)):
-                away_x, away_y = own_x - to_x[m], own_y - to_y[m]
-                square = away_x * away_x + away_y * away_y
-                next_one[m] = square if square < next_one[m] else next_one[m]
+    for k in range(count - 1):
+        own_x, own_y, own = x[k], y[k], least[k]
+        to_x, to_y, next_one = x[k + 1 :], y[k + 1 :], least[k + 1 :]
+        for m in range(len(next_one)):
+            away_x, away_y = own_x - to_x[m], own_y - to_y[m]
+            square = away_x * away_x + away_y * away_y
+            next_one[m] = square if square < next_one[m] else next_one[m]
+            own = square if square < own else own
+        least[k] = own
     return np.asarray(np.sqrt(least))
 
 

@@ -25,7 +25,7 @@ _bands, _bench = types.UniTuple(BAND, 2), types.Tuple((FLOATS_1, FLOATS_2))  # t
 ON_SURFACE_MM = 1e-9
 """Newton's method stops after a shorter step: the next would be far below rounding."""
 
-AT_ONCE = 8
+AT_ONCE = 4
 """Columns of a matrix that are factorized at once."""
 
 
@@ -83,8 +83,8 @@ def _factorize(columns: FloatArray, count: int, width: int) -> bool:
     """Replace the lower band of a matrix by its Cholesky factor; whether it has one.
 
     Each row of the array holds one column of the band, padded by `AT_ONCE`; so many more rows
-    follow the last. `AT_ONCE` columns are eliminated together, so that each column after them is
-    read and written once.
+    follow the last. `AT_ONCE` columns are eliminated together, from two columns after them at a
+    time: each is read and written less often.
     """
     for j in range(0, count, AT_ONCE):
         for a in range(min(AT_ONCE, count - j)):
@@ -99,17 +99,15 @@ def _factorize(columns: FloatArray, count: int, width: int) -> bool:
             for k in range(width + 1):
                 own[k] *= scale
         c0, c1, c2, c3 = columns[j], columns[j + 1], columns[j + 2], columns[j + 3]
-        c4, c5, c6, c7 = columns[j + 4], columns[j + 5], columns[j + 6], columns[j + 7]
-        for t in range(AT_ONCE, min(AT_ONCE + width, count - j)):
-            own = columns[j + t]
+        for t in range(AT_ONCE, min(AT_ONCE + width, count - j), 2):
             f0, f1, f2, f3 = c0[t], c1[t - 1], c2[t - 2], c3[t - 3]
-            f4, f5, f6, f7 = c4[t - 4], c5[t - 5], c6[t - 6], c7[t - 7]
-            s0, s1, s2, s3 = c0[t:], c1[t - 1 :], c2[t - 2 :], c3[t - 3 :]
-            s4, s5, s6, s7 = c4[t - 4 :], c5[t - 5 :], c6[t - 6 :], c7[t - 7 :]
-            for k in range(width + AT_ONCE - t):
-                own[k] -= (f0 * s0[k] + f1 * s1[k] + f2 * s2[k] + f3 * s3[k]) + (
-                    f4 * s4[k] + f5 * s5[k] + f6 * s6[k] + f7 * s7[k]
-                )
+            g0, g1, g2, g3 = c0[t + 1], c1[t], c2[t - 1], c3[t - 2]
+            s0, s1, s2, s3 = c0[t + 1 :], c1[t:], c2[t - 1 :], c3[t - 2 :]
+            columns[j + t, 0] -= f0 * f0 + f1 * f1 + f2 * f2 + f3 * f3
+            own, other = columns[j + t, 1:], columns[j + t + 1]
+            for k in range(width + AT_ONCE - 1 - t):
+                own[k] -= f0 * s0[k] + f1 * s1[k] + f2 * s2[k] + f3 * s3[k]
+                other[k] -= g0 * s0[k] + g1 * s1[k] + g2 * s2[k] + g3 * s3[k]
     return True
 
 
