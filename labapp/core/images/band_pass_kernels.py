@@ -211,7 +211,9 @@ def _upsampled(band: Grey, v: int, u: int, taps: Grey, patch: Grey, four: Grey) 
 
 
 @_inner
-def _is_upsampled_peak(fours: Grey, number: IntArray, disc: BoolArray, v: int, u: int) -> bool:
+def _is_upsampled_peak(
+    fours: Grey, number: npt.NDArray[np.int32], disc: BoolArray, v: int, u: int
+) -> bool:
     """Whether no upsampled pixel of a disc about a pixel exceeds it.
 
     ``fours``, shape (n, 4), holds the upsampled values of n pixels of the band, and ``number``,
@@ -253,7 +255,7 @@ def upsampled_peaks(
         Columns and rows, shape (2, n), and the upsampled band there, shape (n,).
     """
     over = _pixels_over(band, low)
-    number = np.full(band.shape, -1)
+    number = np.full(band.shape, -1, np.int32)
     fours, patch = np.empty((len(over), 4), np.float32), np.empty((7, 7), np.float32)
     # Lagrange's polynomials through six pixels.
     taps = np.array([77, -693, 6930, 2310, -495, 63], np.float32) / np.float32(8192)

@@ -306,10 +306,14 @@ def medians_around(values: FloatArray) -> FloatArray:
             for k in range(max(i - 2, 0), min(i + 3, rows)):
                 for m in range(max(j - 2, 0), min(j + 3, columns)):
                     if (k != i or m != j) and not np.isnan(values[k, m]):
-                        around[count] = values[k, m]
+                        at = count  # sorted
+                        while at and around[at - 1] > values[k, m]:
+                            around[at] = around[at - 1]
+                            at -= 1
+                        around[at] = values[k, m]
                         count += 1
             if count:
-                medians[i, j] = np.median(around[:count])
+                medians[i, j] = (around[(count - 1) // 2] + around[count // 2]) / 2
     return medians
 
 
@@ -391,6 +395,8 @@ def failing_labels(
 ) -> BoolArray:
     """Mask of labels that their ray does not explain, the worst of adjacent ones (`unsupported`).
 
+    Labels without a labelled neighbour, also diagonally, are in the mask, too.
+
     Parameters
     ----------
     labels
@@ -443,11 +449,12 @@ def failing_labels(
     distance, deviance = _deviances(off, both, excess)
     rim_gate = min(max(rim_sigma2, rim_times * np.median(distance)), gate)
     around = _with_variance(inflation * drawn[missed], error)
-    worst = np.zeros(labels.shape)
+    worst, fails = np.zeros(labels.shape), np.zeros(labels.shape, np.bool_)
     for n in range(len(rays)):
         i, j = rays[n] // labels.shape[1], rays[n] % labels.shape[1]
         beside = labels[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
-        at_rim = np.sum(beside >= 0) - 1 <= rim_neighbours
+        neighbours = np.sum(beside >= 0) - 1
+        at_rim, fails[i, j] = neighbours <= rim_neighbours, neighbours == 0
         # If the dot is false, the ray shows none: odds of ``shows``.
         by_ray = deviance[n] + 2.0 * np.log(1.0 - shows[n]) - 2.0 * np.log(max(shows[n], 1e-300))
         rival = min(
@@ -457,8 +464,7 @@ def failing_labels(
         is_far = distance[n] > (rim_gate if at_rim else gate)
         if is_far or by_ray + margin > false or deviance[n] + margin > rival:
             worst[i, j] = distance[n]
-    fails = np.zeros(labels.shape, np.bool_)
     for i in range(len(labels)):
         for j in range(labels.shape[1]):
-            fails[i, j] = worst[i, j] > 0.0 and _is_worst_around(worst, i, j)
+            fails[i, j] |= worst[i, j] > 0.0 and _is_worst_around(worst, i, j)
     return fails
