@@ -181,6 +181,7 @@ def measure(
     prior: Prior | None = None,
     correction: ByHand | None = None,
     on_step: OnStep = lambda _: None,
+    dots: Dots | None = None,
 ) -> tuple[Measurement, Prior | None]:
     """Measure the pool in a frame. A bad frame raises no error: the status gives the reason.
 
@@ -202,6 +203,8 @@ def measure(
     on_step
         Called when a step of an uncorrected frame is completed, with its name: ``dots``; with fit
         also ``surface``, when rays and surface are known, and ``measures``.
+    dots
+        The frame's dots if they have been found with the tuning of the prior (`quick_dots`).
 
     Returns
     -------
@@ -226,7 +229,8 @@ def measure(
         elif prior is not None:
             from labapp.core.sequence.tracking import track
 
-            dots = quick_dots(_as_before(image, prior), prior.tuning, settings.dots.band_pass)
+            if dots is None:
+                dots = quick_dots(_as_before(image, prior), prior.tuning, settings.dots.band_pass)
             result = replace(result, dots=dots)
             on_step("dots")
             observed = Observation.of(dots, bench, frame_shape)

@@ -15,7 +15,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -33,7 +33,7 @@ from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.tables import table_rows
 from labapp.media import Frame, GreyImage, open_source
-from labapp.simulation.parallel import NICE, Here, held, hold, in_order, worker_pool
+from labapp.simulation.parallel import NICE, ONE_THREAD, Here, held, hold, in_order, worker_pool
 
 if TYPE_CHECKING:
     from labapp.core.recording.chain import WarmChain
@@ -60,8 +60,8 @@ ones."""
 BY_THEMSELVES = frozenset({0, 1, 2})
 """Frames of a stretch that are measured without tracking, to vote independently on its rows."""
 
-BATCH = 20
-"""Frames that a process returns at once."""
+BATCH, READ_AT_ONCE = 20, 8
+"""Frames that a process returns at once, and tracked frames that are read at once."""
 
 Read = Callable[[int], Frame]
 """Reads a frame by its number; raises `InputError` if it cannot."""
@@ -173,7 +173,12 @@ def _cold(
 
 
 def _one_thread() -> AbstractContextManager[object]:
-    """Limit BLAS to one thread: the matrices are small, and more threads are slower."""
+    """Limit BLAS to one thread: the matrices are small, and more threads are slower.
+
+    A worker process has this limit from its start: setting it takes a hundredth of a frame's time.
+    """
+    if all(os.environ.get(name) == "1" for name in ONE_THREAD):
+        return nullcontext()
     limited: AbstractContextManager[object] = _threads().limit(limits=1, user_api="blas")
     return limited
 
@@ -280,26 +285,41 @@ class WarmMeasurer:
             yield from _with_rows_voted(stretch, self.setup, self.settings, warm=True)
 
     def _stretch(self, frames: Iterable[int]) -> Generator[FrameResult]:
+        warm, place = self._chain(), 0
         last: int | None = None
         step: int | None = None
-        for place, number in enumerate(frames):
-            if place in BY_THEMSELVES:
-                warm = self._chain()
-            before = None if last is None else number - last
-            if step is not None and before != step:
-                warm.skip()
-            last, step = number, before
-            frame = _read(self.read, number, self.setup, self.settings)
-            if isinstance(frame, FrameResult):
-                warm.skip()
-                yield frame
-            elif (correction := self.corrected(number)) is not None:
-                warm.skip()
-                yield _cold(number, frame, self.setup, self.settings, correction)
-            else:
-                with _one_thread():
-                    found = warm.measure(frame.image)
-                yield FrameResult(number, frame.time_s, found, warm.track_lost)
+        for read in self._read_ahead(frames):
+            warm.look_ahead(frame.image for _, frame in read if isinstance(frame, Frame))
+            for number, frame in read:
+                if place in BY_THEMSELVES:
+                    warm = self._chain()
+                before = None if last is None else number - last
+                if step is not None and before != step:
+                    warm.skip()
+                place, last, step = place + 1, number, before
+                if isinstance(frame, FrameResult):
+                    warm.skip()
+                    yield frame
+                elif (correction := self.corrected(number)) is not None:
+                    warm.skip()
+                    yield _cold(number, frame, self.setup, self.settings, correction)
+                else:
+                    with _one_thread():
+                        found = warm.measure(frame.image)
+                    yield FrameResult(number, frame.time_s, found, warm.track_lost)
+
+    def _read_ahead(self, frames: Iterable[int]) -> Iterator[list[tuple[int, Frame | FrameResult]]]:
+        """Yield numbers and frames (`_read`), some at once, see `_next_batch`."""
+        numbers = iter(frames)
+        while chosen := list(islice(numbers, READ_AT_ONCE)):
+            read: list[tuple[int, Frame | FrameResult]] = []
+            try:
+                for number in chosen:
+                    read.append((number, _read(self.read, number, self.setup, self.settings)))
+            except InputError:  # after the frames before it
+                yield read
+                raise
+            yield read
 
     def _chain(self) -> WarmChain | _ChainElsewhere:
         from labapp.core.recording.chain import WarmChain
@@ -316,6 +336,9 @@ class _ChainElsewhere:
         self.track_lost: str | None = None
         self._pool = pool
         pool.submit(hold, _new_chain, setup, settings)
+
+    def look_ahead(self, images: Iterable[GreyImage]) -> None:
+        """Do nothing, as each frame is passed by itself."""
 
     def skip(self) -> None:
         """Skip a frame."""
@@ -376,15 +399,22 @@ class RecordingMeasurer:
         return self._in_processes(list(frames)) if self.pools else self._here(frames)
 
     def _here(self, frames: Iterable[int]) -> Generator[FrameResult]:
+        yield from map(self.with_rows, self.measured(frames))
+
+    def measured(self, frames: Iterable[int]) -> Generator[FrameResult]:
+        """Measure frames in this process, without the rows of the tables."""
         with open_source(self.path, self.index) as source:
-            for result in WarmMeasurer(source.frame, self.setup, self.settings)(frames):
-                found = result.measurement
-                yield replace(
-                    result,
-                    measurement=found if self.with_surfaces else without_surface(found),
-                    residuals=None if self.with_surfaces else Residuals.of(found),
-                    rows=table_rows(result, self.setup.calibration, self.sigma_parts),
-                )
+            yield from WarmMeasurer(source.frame, self.setup, self.settings)(frames)
+
+    def with_rows(self, result: FrameResult) -> FrameResult:
+        """Add the rows of the tables to a result, and omit what they replace."""
+        found = result.measurement
+        return replace(
+            result,
+            measurement=found if self.with_surfaces else without_surface(found),
+            residuals=None if self.with_surfaces else Residuals.of(found),
+            rows=table_rows(result, self.setup.calibration, self.sigma_parts),
+        )
 
     def _in_processes(self, frames: Sequence[int]) -> Generator[FrameResult]:
         there = replace(self, pools=())
@@ -406,16 +436,20 @@ class RecordingMeasurer:
 
 def _first_batch(measurer: RecordingMeasurer, frames: Sequence[int]) -> list[FrameResult]:
     """Begin a stretch in this process, and end the previous one."""
-    if isinstance(previous := held(), Generator):
-        previous.close()
+    if held() is not None:
+        held()[1].close()
     cv2.setNumThreads(1)
-    hold(measurer, frames)
+    hold(lambda: (measurer, measurer.measured(frames)))
     return _next_batch()
 
 
 def _next_batch() -> list[FrameResult]:
-    """Return the next results of the stretch that this process holds."""
-    return list(islice(held(), BATCH))
+    """Return the next results of the stretch that this process holds.
+
+    All frames come before all rows: the processor's caches hold the code and data of one task.
+    """
+    measurer, results = held()
+    return list(map(measurer.with_rows, list(islice(results, BATCH))))
 
 
 @contextmanager

@@ -9,10 +9,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from labapp.core import pipeline
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
+from labapp.core.images.band_pass import DetectorTuning, quick_dots
+from labapp.core.images.dots import BandPassSettings, Dots, Image
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.recording.chain import WarmChain
 from labapp.core.values import FloatArray
@@ -274,18 +277,42 @@ def test_another_pool_with_as_many_rays_starts_a_new_track() -> None:
     assert follower.track_lost is None
 
 
-def test_pool_that_jumps_is_measured_again() -> None:
+@cache
+def frame_of_another_pool() -> RecordedFrame:
     other = egg(5.6, 2.6, 3.4, 0.2, (0.3, -0.2))
     recording = Recording(
         file="recording.avi", rig=RIG, view=VIEW, look=Look(), pools=(other,), seed=62,
         frame_rate_hz=RATE_HZ,
     )  # fmt: skip
-    frame, follower = recording.frame(0), chain()
+    return recording.frame(0)
+
+
+def test_pool_that_jumps_is_measured_again() -> None:
+    frame, follower = frame_of_another_pool(), chain()
     result = follower.measure(frame.image)
     assert wrong_rays(result, frame) == 0
     if result.measures is not None:
         error = result.measures.height_mm - frame.pool.size.height_mm
         assert abs(error) < 4 * result.measures.height_sigma_mm
+
+
+def test_dots_found_ahead_give_the_same_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a frame measured without a prior they are found again, with its tuning."""
+    jumped, (before, after) = frame_of_another_pool(), frames()[WARMED:]
+    images = [before.image, jumped.image, after.image]
+    follower, ahead = chain(), chain()
+    expected = [follower.measure(image).measures for image in images]
+    found_again = []
+
+    def detect(image: Image, tuning: DetectorTuning, settings: BandPassSettings) -> Dots:
+        found_again.append(image)
+        return quick_dots(image, tuning, settings)
+
+    monkeypatch.setattr(pipeline, "quick_dots", detect)
+    ahead.look_ahead(images)
+    for image, measures in zip(images, expected, strict=True):
+        assert_same(ahead.measure(image).measures, measures)
+    assert [image is after.image for image in found_again] == [True]
 
 
 def test_following_resumes_after_a_lost_frame() -> None:

@@ -84,14 +84,15 @@ def next_apart(places: FloatArray) -> FloatArray:
     """Distance of each place, shape (n, 2), to the nearest other, shape (n,); infinite if n = 1."""
     count = len(places)
     x, y, least = places[:, 0].copy(), places[:, 1].copy(), np.full(count, np.inf)
-    for k in range(count):
-        own_x, own_y = x[k], y[k]
-        for first, last in ((0, k), (k + 1, count)):
-            to_x, to_y, next_one = x[first:last], y[first:last], least[first:last]
-            for m in range(len(next_one)):
-                away_x, away_y = own_x - to_x[m], own_y - to_y[m]
-                square = away_x * away_x + away_y * away_y
-                next_one[m] = square if square < next_one[m] else next_one[m]
+    for k in range(count - 1):
+        own_x, own_y, own = x[k], y[k], least[k]
+        to_x, to_y, next_one = x[k + 1 :], y[k + 1 :], least[k + 1 :]
+        for m in range(len(next_one)):
+            away_x, away_y = own_x - to_x[m], own_y - to_y[m]
+            square = away_x * away_x + away_y * away_y
+            next_one[m] = square if square < next_one[m] else next_one[m]
+            own = square if square < own else own
+        least[k] = own
     return np.asarray(np.sqrt(least))
 
 
@@ -111,10 +112,10 @@ def _is_peak(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
 @_inner
 def _any_over(values: Grey, floor: Grey) -> bool:
     """Whether any value exceeds its floor; without an early exit, so that it vectorises."""
-    some = np.int32(0)
+    some = False
     for k in range(len(values)):
-        some |= np.int32(values[k] > floor[k])
-    return bool(some)
+        some |= values[k] > floor[k]
+    return some
 
 
 BLOCK = 32
@@ -210,7 +211,9 @@ def _upsampled(band: Grey, v: int, u: int, taps: Grey, patch: Grey, four: Grey) 
 
 
 @_inner
-def _is_upsampled_peak(fours: Grey, number: IntArray, disc: BoolArray, v: int, u: int) -> bool:
+def _is_upsampled_peak(
+    fours: Grey, number: npt.NDArray[np.int32], disc: BoolArray, v: int, u: int
+) -> bool:
     """Whether no upsampled pixel of a disc about a pixel exceeds it.
 
     ``fours``, shape (n, 4), holds the upsampled values of n pixels of the band, and ``number``,
@@ -252,7 +255,7 @@ def upsampled_peaks(
         Columns and rows, shape (2, n), and the upsampled band there, shape (n,).
     """
     over = _pixels_over(band, low)
-    number = np.full(band.shape, -1, np.int64)
+    number = np.full(band.shape, -1, np.int32)
     fours, patch = np.empty((len(over), 4), np.float32), np.empty((7, 7), np.float32)
     # Lagrange's polynomials through six pixels.
     taps = np.array([77, -693, 6930, 2310, -495, 63], np.float32) / np.float32(8192)
@@ -293,48 +296,46 @@ def _beside(image: Picture, v: int, u: int, away: int) -> float:
     At an edge the picture is reflected about its last pixel.
     """
     height, width = image.shape
-    above, below, left, right = v - away, v + away, u - away, u + away
-    if above < 0 or below >= height or left < 0 or right >= width:
-        above, below = abs(above), height - 1 - abs(height - 1 - below)
-        left, right = abs(left), width - 1 - abs(width - 1 - right)
+    above, below = _mirrored(v - away, height), _mirrored(v + away, height)
+    left, right = _mirrored(u - away, width), _mirrored(u + away, width)
     along = float(image[above, u]) + float(image[below, u])
     across = float(image[v, left]) + float(image[v, right])
     return 0.5 * min(along, across)
 
 
 @_inner
-def _falls(image: Picture, v: int, near: Line, far: Line, falls: Line) -> None:
-    """Compute twice the fall of light from each pixel of a row to its surroundings, grey levels.
+def _mirrored(at: int, count: int) -> int:
+    """Index of a pixel with reflection about the first and the last one."""
+    return count - 1 - abs(count - 1 - abs(at))
 
-    ``near`` and ``far`` are scratch memory, each as long as a row.
-    """
+
+@_inner
+def _falls_inside(
+    above: Picture, below: Picture, high: Picture, low: Picture, row: Picture, falls: Line
+) -> None:
+    """Compute `_falls` of a row but for two pixels at either end; the four rows begin there."""
+    narrow, left, own, right, farther = falls.dtype.type, row[1:], row[2:], row[3:], row[4:]
+    for u in range(len(falls)):
+        along, across = narrow(above[u] + below[u]), narrow(left[u] + right[u])
+        near = along if along < across else across
+        along, across = narrow(high[u] + low[u]), narrow(row[u] + farther[u])
+        far = along if along < across else across
+        falls[u] = 2 * own[u] - (near if near < far else far)
+
+
+@_inner
+def _falls(image: Picture, v: int, falls: Line) -> None:
+    """Compute twice the fall of light from each pixel of a row to its surroundings, grey levels."""
     (height, width), first, last = image.shape, 0, 0
-    if 2 <= v < height - 2 and width > 4:  # away from the edges: vectorised
+    if width > 4:  # away from the edges: vectorised
         first, last = 2, width - 2
-        row, inner = image[v], falls[first:last]
-        _least_sum(image[v - 1, 2:], image[v + 1, 2:], row[1:], row[3:], inner, near)
-        _least_sum(image[v - 2, 2:], image[v + 2, 2:], row, row[4:], inner, far)
-        own = row[2:]
-        for u in range(len(inner)):
-            least = near[u] if near[u] < far[u] else far[u]
-            inner[u] = 2 * own[u] - least
+        above, below = image[_mirrored(v - 1, height), 2:], image[_mirrored(v + 1, height), 2:]
+        high, low = image[_mirrored(v - 2, height), 2:], image[_mirrored(v + 2, height), 2:]
+        _falls_inside(above, below, high, low, image[v], falls[first:last])
     for k in range(first + width - last):
         u = k if k < first else last + k - first
         least = min(_beside(image, v, u, 1), _beside(image, v, u, 2))
         falls[u] = 2.0 * float(image[v, u]) - 2.0 * least
-
-
-@_inner
-def _least_sum(
-    above: Picture, below: Picture, left: Picture, right: Picture, other: Line, least: Line
-) -> None:
-    """Write the lesser of two sums to ``least``; separate loops vectorise best."""
-    for u in range(len(other)):
-        least[u] = above[u] + below[u]
-    for u in range(len(other)):
-        other[u] = left[u] + right[u]
-    for u in range(len(other)):
-        least[u] = least[u] if least[u] < other[u] else other[u]
 
 
 @_inner
@@ -376,10 +377,9 @@ def spikes(
     far = far if far < 4.0 else np.inf  # smaller dots have no light at distance 2
     # For a picture of bytes these are 16-bit integers.
     falls, floor = image[0] * np.int16(0), image[0] * np.int16(0)
-    sums, others = falls.copy(), falls.copy()
     floor[:] = 2.0 * over
     for v in range(height):
-        _falls(image, v, sums, others, falls)
+        _falls(image, v, falls)
         if not _any_over(falls, floor):
             continue
         for first in range(0, width, BLOCK):

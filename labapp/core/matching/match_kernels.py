@@ -266,32 +266,26 @@ def classify_rays(
     seen = within_view(shown, np.zeros_like(shown), view[0], view[1], view[2]) & ~blocked
 
     among = np.flatnonzero(amid_lit[known] & ~dotless[known])
-    merged = next_apart(shown[among]) < resolution
-    is_missed = seen[among] & ~merged & ~lit[known[among]]
-    missed = known[among[is_missed]]
+    unlit = among[seen[among] & ~lit[known[among]]]
+    apart = two_nearest(shown[unlit], shown[among])[0][:, 1]
+    missed = known[unlit[apart >= resolution]]
     unlabelled = np.ones(len(dots), np.bool_)
     for label in labels.ravel():
         if label >= 0:
             unlabelled[label] = False
     stray = np.flatnonzero(unlabelled)
     candidates = dots[stray]
-    around = np.flatnonzero(widened(amid(is_lit), 1).ravel()[known] & ~dotless[known])
-    around = around[next_apart(shown[around]) < resolution]
-    if len(stray) and len(around):
-        apart = two_nearest(candidates, shown[around])[0][:, 0] > resolution
-        stray = stray[apart]
+    if len(stray):
+        around = np.flatnonzero(widened(amid(is_lit), 1).ravel()[known] & ~dotless[known])
+        around = around[next_apart(shown[around]) < resolution]
+        stray = stray[two_nearest(candidates, shown[around])[0][:, 0] > resolution]
 
-    spacing = next_apart(shown)
     witness = np.zeros(len(plane), np.int64)
+    unlit = np.flatnonzero(seen & ~(amid_lit | dotless)[known])
+    spacing = next_apart(shown)[unlit]
     # A stray dot near a prediction may be the dot of a ray that seems dark.
-    away = np.full(len(known), np.inf)
-    if len(candidates):
-        away = two_nearest(shown, candidates)[0][:, 0]
-    for k in range(len(known)):
-        ray = known[k]
-        may_be_lit = amid_lit[ray] or dotless[ray] or away[k] < spacing[k]
-        if seen[k] and spacing[k] >= resolution and not may_be_lit:
-            witness[ray] = -1
+    away = two_nearest(shown[unlit], candidates)[0][:, 0]
+    witness[known[unlit[(spacing >= resolution) & (away >= spacing)]]] = -1
     witness[lit] = 1
     return witness, missed, stray
 
@@ -312,10 +306,14 @@ def medians_around(values: FloatArray) -> FloatArray:
             for k in range(max(i - 2, 0), min(i + 3, rows)):
                 for m in range(max(j - 2, 0), min(j + 3, columns)):
                     if (k != i or m != j) and not np.isnan(values[k, m]):
-                        around[count] = values[k, m]
+                        at = count  # sorted
+                        while at and around[at - 1] > values[k, m]:
+                            around[at] = around[at - 1]
+                            at -= 1
+                        around[at] = values[k, m]
                         count += 1
             if count:
-                medians[i, j] = np.median(around[:count])
+                medians[i, j] = (around[(count - 1) // 2] + around[count // 2]) / 2
     return medians
 
 
@@ -397,6 +395,8 @@ def failing_labels(
 ) -> BoolArray:
     """Mask of labels that their ray does not explain, the worst of adjacent ones (`unsupported`).
 
+    Labels without a labelled neighbour, also diagonally, are in the mask, too.
+
     Parameters
     ----------
     labels
@@ -449,11 +449,12 @@ def failing_labels(
     distance, deviance = _deviances(off, both, excess)
     rim_gate = min(max(rim_sigma2, rim_times * np.median(distance)), gate)
     around = _with_variance(inflation * drawn[missed], error)
-    worst = np.zeros(labels.shape)
+    worst, fails = np.zeros(labels.shape), np.zeros(labels.shape, np.bool_)
     for n in range(len(rays)):
         i, j = rays[n] // labels.shape[1], rays[n] % labels.shape[1]
         beside = labels[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
-        at_rim = np.sum(beside >= 0) - 1 <= rim_neighbours
+        neighbours = np.sum(beside >= 0) - 1
+        at_rim, fails[i, j] = neighbours <= rim_neighbours, neighbours == 0
         # If the dot is false, the ray shows none: odds of ``shows``.
         by_ray = deviance[n] + 2.0 * np.log(1.0 - shows[n]) - 2.0 * np.log(max(shows[n], 1e-300))
         rival = min(
@@ -463,8 +464,7 @@ def failing_labels(
         is_far = distance[n] > (rim_gate if at_rim else gate)
         if is_far or by_ray + margin > false or deviance[n] + margin > rival:
             worst[i, j] = distance[n]
-    fails = np.zeros(labels.shape, np.bool_)
     for i in range(len(labels)):
         for j in range(labels.shape[1]):
-            fails[i, j] = worst[i, j] > 0.0 and _is_worst_around(worst, i, j)
+            fails[i, j] |= worst[i, j] > 0.0 and _is_worst_around(worst, i, j)
     return fails

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labapp.core.match import missing_share
-from labapp.core.matching.observation import UNLABELLED, Observation, neighbours_of
+from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.matching.prediction import (
     FALSE_DOTS_PER_MM2,
     GATE_SIGMA2,
@@ -148,12 +148,7 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
         stray,
         limits,
     )
-    return np.asarray(labels[fails | _wide(observed, fitted) | isolated(lit)])
-
-
-def isolated(lit: BoolArray) -> BoolArray:
-    """Labelled rays without a labelled one beside them, also diagonally, shape (rows, columns)."""
-    return np.asarray(lit & (neighbours_of(lit) == 0))
+    return np.asarray(labels[fails | _wide(observed, fitted)])
 
 
 def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:

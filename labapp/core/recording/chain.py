@@ -5,14 +5,17 @@ The same frames give the same results: nothing depends on the clock or on the nu
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 
 from labapp.core.geometry.bench import Bench
-from labapp.core.images.dots import Image
+from labapp.core.images.band_pass import quick_dots
+from labapp.core.images.dots import Dots, Image
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.sequence.prior import Prior
 from labapp.core.sequence.tracking import HELD
+from labapp.core.values import CannotMeasure
 
 
 class WarmChain:
@@ -41,6 +44,20 @@ class WarmChain:
         self.track_lost: str | None = None
         self._prior: Prior | None = None
         self._after_gap = False
+        self._ahead: list[tuple[Image, Dots]] = []
+
+    def look_ahead(self, images: Iterable[Image]) -> None:
+        """Find the dots of some following frames at once, if they will be tracked.
+
+        This takes less time than frame by frame, as the code and data of the tracking would replace
+        those of the detector in the processor's caches. The results are the same.
+        """
+        self._ahead = []
+        if self._prior is not None:
+            tuning, settings = self._prior.tuning, self.settings.dots.band_pass
+            for image in images:
+                with suppress(CannotMeasure, ValueError):  # of that frame, when it is measured
+                    self._ahead.append((image, quick_dots(image, tuning, settings)))
 
     def skip(self) -> None:
         """Skip a frame, after which frames are no longer equally spaced in time.
@@ -58,8 +75,9 @@ class WarmChain:
         if self._prior is None:
             self.track_lost = "no earlier frame was measured"
             return None
+        dots = next((dots for known, dots in self._ahead if known is image), None)
         measurement, prior = measure(
-            image, self.bench, self.settings, self._prior, on_step=self._on_step
+            image, self.bench, self.settings, self._prior, on_step=self._on_step, dots=dots
         )
         if prior is None:
             self.track_lost = measurement.reason
@@ -89,4 +107,6 @@ class WarmChain:
         """Store a frame's prior; after a gap without the surfaces of the frames before the gap."""
         if prior is not None and self._after_gap:
             prior = replace(prior, past=prior.past[-1:], slopes=prior.slopes[-1:])
+        if prior is None or self._prior is None or prior.tuning is not self._prior.tuning:
+            self._ahead = []
         self._prior, self._after_gap = prior, False

@@ -19,19 +19,19 @@ def cubic_splines(axis: FloatArray, place: float, value: FloatArray, slope: Floa
 
     The axis is a row of ``grid``; a place beyond its ends is moved to them.
     """
-    low, high, step = axis[0], axis[1], axis[2]
-    at = (min(max(place, low), high) - low) / step
+    low, high, per_mm = axis[0], axis[1], 1.0 / axis[2]  # one division, and no other in a loop
+    at = (min(max(place, low), high) - low) * per_mm
     first = min(int(at), int(axis[3]) - 1) if at > 0.0 else 0
     t = at - first
     s = 1.0 - t
     value[0] = s * s * s / 6.0
-    value[1] = ((3.0 * t - 6.0) * t * t + 4.0) / 6.0
-    value[2] = ((3.0 * s - 6.0) * s * s + 4.0) / 6.0
+    value[1] = (0.5 * t - 1.0) * t * t + 2.0 / 3.0
+    value[2] = (0.5 * s - 1.0) * s * s + 2.0 / 3.0
     value[3] = t * t * t / 6.0
-    slope[0] = -s * s / 2.0 / step
-    slope[1] = (1.5 * t - 2.0) * t / step
-    slope[2] = (2.0 - 1.5 * s) * s / step
-    slope[3] = t * t / 2.0 / step
+    slope[0] = -0.5 * s * s * per_mm
+    slope[1] = (1.5 * t - 2.0) * t * per_mm
+    slope[2] = (2.0 - 1.5 * s) * s * per_mm
+    slope[3] = 0.5 * t * t * per_mm
     return first
 
 
