@@ -491,7 +491,7 @@ def load_all() -> None:
     import labapp.core.recording.row_vote
     import labapp.core.rows.lattice_kernels
     import labapp.core.surface.kernels.boundary_kernels
-    import labapp.core.surface.kernels.rounds_kernels
+    import labapp.core.surface.kernels.fit_kernels
     import labapp.core.surface.kernels.setup_kernels
     import labapp.core.surface.kernels.shape_kernels
     import labapp.export.fixed_point
