@@ -78,21 +78,20 @@ def clearance_table() -> Table:
     for angle in ANGLES_DEG:
         for surface, slope in surfaces.items():
             found = clearance(positioning_rig(angle), slope)
-            d1 = found.least_plane_mm + 0.0, found.most_plane_mm + 0.0
-            rows.append((angle, surface, slope, found.l1_mm, found.l2_mm, *d1))
-    return Table(
+            row: dict[str, Cell] = {
+                "projection_angle_deg": angle,
+                "surface": surface,
+                "head_slope_deg": slope,
+                "l1_mm": found.l1_mm,
+                "l2_mm": found.l2_mm,
+                "d1_least_mm": found.least_plane_mm + 0.0,
+                "d1_most_mm": found.most_plane_mm + 0.0,
+            }
+            rows.append(row)
+    return Table.of(
         "l1_l2_d1",
         "L1, L2 and D1 (Eq. 4-14 … 4-18): laser 30 mm away, electrode 5 mm, plane 0 to 101.6 mm up",
-        (
-            "projection_angle_deg",
-            "surface",
-            "head_slope_deg",
-            "l1_mm",
-            "l2_mm",
-            "d1_least_mm",
-            "d1_most_mm",
-        ),
-        tuple(rows),
+        rows,
     )
 
 

@@ -123,7 +123,7 @@ def _row(what: str, one: Candidate, error_mm: float) -> tuple[Cell, ...]:
 
 def cost_table(advice: Advice) -> Table:
     """Mean cost of each mm and degree away, up to the first violated constraints."""
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[dict[str, Cell]] = []
     for sweep in advice.sweeps:
         own = int(np.argmin(np.abs(sweep.value - getattr(advice.best.place, sweep.name))))
         # The reflected rays change from pool to pool: the slope over a short way is chance.
@@ -140,32 +140,24 @@ def cost_table(advice: Advice) -> Table:
                 if np.isfinite(sweep.error_mm[[own, end]]).all():
                     more = float(1000 * (sweep.error_mm[end] - sweep.error_mm[own]) / apart)
             wrong = broken[0] if broken else None
+            breaks = () if wrong is None else sweep.breaks(wrong)
+            words, unit = WORDS[sweep.name]
             rows.append(
-                (
-                    *WORDS[sweep.name],
-                    "less" if way < 0 else "more",
-                    more,
-                    float(sweep.value[kept[-1] if kept else own]),
-                    None if wrong is None else float(sweep.value[wrong]),
-                    "; ".join(CONSTRAINTS[name][0] for name in sweep.breaks(wrong))
-                    if wrong is not None
-                    else "",
-                )
+                {
+                    "quantity": words,
+                    "unit": unit,
+                    "way": "less" if way < 0 else "more",
+                    "more_error_um_per_unit": more,
+                    "kept_to": float(sweep.value[kept[-1] if kept else own]),
+                    "broken_at": None if wrong is None else float(sweep.value[wrong]),
+                    "what_breaks": "; ".join(CONSTRAINTS[name][0] for name in breaks),
+                }
             )
-    return Table(
+    return Table.of(
         "cost",
         "Cost of each mm and degree away from the recommended set-up, µm of error; last value that "
         "meets all conditions and first that does not, of those checked",
-        (
-            "quantity",
-            "unit",
-            "way",
-            "more_error_um_per_unit",
-            "kept_to",
-            "broken_at",
-            "what_breaks",
-        ),
-        tuple(rows),
+        rows,
     )
 
 
