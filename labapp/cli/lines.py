@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from labapp.cli.shared import (
-    FRAMES_HELP,
-    FRAMES_METAVAR,
     INTERRUPTED,
     NOTHING_MEASURED,
-    RECORDING_HELP,
+    FrameRange,
+    Recording,
     finite,
     note,
     progress_bar,
@@ -33,10 +32,10 @@ if TYPE_CHECKING:
 
 
 def lines(
-    source: Annotated[Path, typer.Argument(help=RECORDING_HELP)],
+    source: Recording,
     setup: Annotated[Path, typer.Option(help='Setup file (TOML) with [pattern] kind = "lines".')],
     out: Annotated[Path, typer.Option(help="Folder for the tables; made if missing.")],
-    frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
+    frames: FrameRange = ":",
     follow: Annotated[
         bool,
         typer.Option(
