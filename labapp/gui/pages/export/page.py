@@ -269,7 +269,6 @@ class ExportPage(Page):
         self.canvas_layout.addWidget(scrolled(inner, "What is exported"))
 
     def _make_panel(self) -> None:
-        form = FieldForm()
         self.which = ChoiceField("Frames", WHICH, tooltip="Which frames to write")
         self.first = whole("From frame", 0, "The first frame to write")
         self.last = whole("To frame", 0, "The last frame to write")
@@ -303,7 +302,7 @@ class ExportPage(Page):
         }
         for name, field in fields.items():
             field.edited.connect(partial(self._enter, name))
-            form.add(field)
+        form = FieldForm(*fields.values())
         self.folder = PathField(
             "Folder",
             tooltip="A new or empty folder, or an earlier export, which is replaced",

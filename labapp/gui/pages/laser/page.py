@@ -123,10 +123,8 @@ class LaserPage(Page):
     # --- the panel --------------------------------------------------------------------------
 
     def _make_panel(self) -> None:
-        form = FieldForm()
         self.way = ChoiceField("Lengths", WAYS, tooltip="Where the lengths of the cross come from")
         self.way.edited.connect(self._show_way)
-        form.add(self.way)
         self.fan = NumberField(
             "Fan angle, full",
             "°",
@@ -157,7 +155,7 @@ class LaserPage(Page):
         )
         for each in (self.fan, self.fan_sigma, self.resolution):
             each.edited.connect(lambda _: self._follow())
-            form.add(each)
+        form = FieldForm(self.way, self.fan, self.fan_sigma, self.resolution)
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
         readings = wrapping_label("Readings, mm: three lines or more")
@@ -173,10 +171,8 @@ class LaserPage(Page):
         self.lock_with_session(self.fan, self.fan_sigma, self.resolution, self.table)
 
     def _picture_part(self) -> QWidget:
-        self.picture_part = FieldForm()
         tip = "A picture of the cross hair beside a scale"
-        self.picture_part.add_wide(button("Load picture…", tip, self._choose_picture))
-        self.picture_part.add_wide(self.answer)
+        load = button("Load picture…", tip, self._choose_picture)
         self.scale = NumberField(
             "Scale length",
             "mm",
@@ -188,12 +184,10 @@ class LaserPage(Page):
         )
         self.scale.set_value(10.0)
         self.scale.edited.connect(lambda _: self._dragged())
-        self.picture_part.add(self.scale)
         self.lengths = Message(2)
-        self.picture_part.add_wide(self.lengths)
         tip = "Add these lengths to the table as a further reading"
         self.add_button = button("Add as a reading", tip, self.add_reading)
-        self.picture_part.add_wide(self.add_button)
+        self.picture_part = FieldForm(load, self.answer, self.scale, self.lengths, self.add_button)
         return self.picture_part
 
     def _show_way(self, way: str) -> None:
