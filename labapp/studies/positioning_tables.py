@@ -33,18 +33,14 @@ def blocking_tables() -> tuple[Table, Table]:
     """Tables 4-1 and 4-2: `rb` if the torch blocks a reflected ray, `ib` for an incident one."""
     made = []
     for number, kind, sign in ((1, "convex", 1), (2, "concave", -1)):
-        rows: list[tuple[Cell, ...]] = [
-            (angle, *(_blocking(angle, radius, sign * depth) for radius, depth in SIZES_MM))
-            for angle in ANGLES_DEG
-        ]
-        made.append(
-            Table(
-                f"table_4_{number}_blocking_{kind}",
-                f"Table 4-{number}, blocking on {kind} surfaces",
-                ("projection_angle_deg", *(f"r{radius}_d{depth:g}" for radius, depth in SIZES_MM)),
-                tuple(rows),
-            )
-        )
+        rows = []
+        for angle in ANGLES_DEG:
+            row: dict[str, Cell] = {"projection_angle_deg": angle}
+            for radius, depth in SIZES_MM:
+                row[f"r{radius}_d{depth:g}"] = _blocking(angle, radius, sign * depth)
+            rows.append(row)
+        name = f"table_4_{number}_blocking_{kind}"
+        made.append(Table.of(name, f"Table 4-{number}, blocking on {kind} surfaces", rows))
     return made[0], made[1]
 
 
@@ -119,13 +115,14 @@ def coverage() -> tuple[Coverage, ...]:
 
 def coverage_table(placements: tuple[Coverage, ...]) -> Table:
     """Number of dots on the 4″ plane and off it."""
-    rows = [
-        (one.distance_mm, len(one.on_plane), int(one.on_plane.sum()), int((~one.on_plane).sum()))
+    rows: list[dict[str, Cell]] = [
+        {
+            "plane_distance_mm": one.distance_mm,
+            "reflected_dots": len(one.on_plane),
+            "on_plane": int(one.on_plane.sum()),
+            "off_plane": int((~one.on_plane).sum()),
+        }
         for one in placements
     ]
-    return Table(
-        "figure_4_11_coverage",
-        "Fig. 4-11, dots on the 4″ plane: convex cap 3/0.3, laser at 30°, 30 mm",
-        ("plane_distance_mm", "reflected_dots", "on_plane", "off_plane"),
-        tuple(rows),
-    )
+    caption = "Fig. 4-11, dots on the 4″ plane: convex cap 3/0.3, laser at 30°, 30 mm"
+    return Table.of("figure_4_11_coverage", caption, rows)
