@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtCore import QUrl
+from PySide6.QtCore import QSignalBlocker, QUrl
 from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QCheckBox, QGridLayout, QWidget
 
@@ -118,9 +118,8 @@ class ExportPage(Page):
     def _lock_choices(self, why: str) -> None:
         """Disable and untick all boxes, with the reason; empty: show the ticks of the request."""
         for key, box in self._boxes.items():
-            box.blockSignals(True)
-            box.setChecked(key in self.request.ticked and not why)
-            box.blockSignals(False)
+            with QSignalBlocker(box):
+                box.setChecked(key in self.request.ticked and not why)
             box.setEnabled(not why and (key != "solid" or self.request.has_mesh))
             box.setToolTip(why or self._tips[key])
         for each in self._tick_buttons:
@@ -183,9 +182,8 @@ class ExportPage(Page):
     def _tick(self, on: bool) -> None:
         """Tick everything, or nothing."""
         for box in self._boxes.values():
-            box.blockSignals(True)
-            box.setChecked(on)
-            box.blockSignals(False)
+            with QSignalBlocker(box):
+                box.setChecked(on)
         self._ticked()
 
     def choose_folder(self) -> None:

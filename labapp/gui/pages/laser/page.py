@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import QHeaderView, QStackedWidget, QTableWidget, QTableWidgetItem, QWidget
 
@@ -200,29 +200,26 @@ class LaserPage(Page):
 
     def _fill(self, readings: Readings) -> None:
         count = max(map(len, readings.lengths_mm))
-        self.table.blockSignals(True)
-        self.table.setRowCount(0)
-        self.table.setRowCount(max(LEAST_ROWS, count + 1))
-        for column, lengths in enumerate(readings.lengths_mm):
-            for row, length in enumerate(lengths):
-                self.table.setItem(row, column, _cell(_length(length)))
-        self.table.blockSignals(False)
+        with QSignalBlocker(self.table):
+            self.table.setRowCount(0)
+            self.table.setRowCount(max(LEAST_ROWS, count + 1))
+            for column, lengths in enumerate(readings.lengths_mm):
+                for row, length in enumerate(lengths):
+                    self.table.setItem(row, column, _cell(_length(length)))
         self.table.fit()
         self.fan.set_value(readings.fan_angle_deg)
         self.fan_sigma.set_value(readings.settings.fan_angle_sigma_deg)
         self.resolution.set_value(readings.settings.resolution_mm)
 
     def _put(self, row: int, texts: list[str]) -> None:
-        self.table.blockSignals(True)
-        for column, text in enumerate(texts):
-            self.table.setItem(row, column, _cell(text))
-        self.table.blockSignals(False)
+        with QSignalBlocker(self.table):
+            for column, text in enumerate(texts):
+                self.table.setItem(row, column, _cell(text))
         self._grow()
 
     def _cell_changed(self, item: QTableWidgetItem) -> None:
-        self.table.blockSignals(True)
-        item.setTextAlignment(RIGHT)
-        self.table.blockSignals(False)
+        with QSignalBlocker(self.table):
+            item.setTextAlignment(RIGHT)
         self._from_picture = None
         self._grow()
         self._follow()

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from PySide6.QtCore import QSize, Qt, QTimer
+from PySide6.QtCore import QSignalBlocker, QSize, Qt, QTimer
 from PySide6.QtGui import (
     QAction,
     QHideEvent,
@@ -385,9 +385,8 @@ class SurfacePage(Page):
         self.high.set_value(high)
         self.true_scale.setChecked(high == 1.0)
         for name, action in self.drawn_items.items():
-            action.blockSignals(True)
-            action.setChecked(getattr(self.options, name))
-            action.blockSignals(False)
+            with QSignalBlocker(action):
+                action.setChecked(getattr(self.options, name))
         if self.options.section is not None:
             self.angle.set_value(self.options.section[0])
             self.offset.set_value(self.options.section[1])
