@@ -7,13 +7,7 @@ from typing import Annotated
 
 import typer
 
-from labapp.cli.shared import (
-    FRAMES_HELP,
-    FRAMES_METAVAR,
-    NOTHING_MEASURED,
-    choose_frames,
-    measure_frames,
-)
+from labapp.cli.shared import NOTHING_MEASURED, FrameRange, choose_frames, measure_frames
 from labapp.cli.window import show_in_app
 from labapp.errors import InputError, os_errors_as_input
 
@@ -45,7 +39,7 @@ def samples(
 
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo_results"),
-    frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
+    frames: FrameRange = ":",
     window: Annotated[
         bool, typer.Option(help="Open the session in the app, where there is a display.")
     ] = True,

@@ -7,14 +7,7 @@ from typing import Annotated
 
 import typer
 
-from labapp.cli.shared import (
-    DETECTOR_HELP,
-    NOTHING_MEASURED,
-    ROWS_HELP,
-    DetectorName,
-    RowsName,
-    check_target,
-)
+from labapp.cli.shared import NOTHING_MEASURED, Detector, Rows, check_target
 from labapp.errors import InputError
 
 
@@ -35,8 +28,8 @@ def detect(
             "diameter. Default: estimated from the image. For the band-pass detector only.",
         ),
     ] = None,
-    detector: Annotated[DetectorName, typer.Option(help=DETECTOR_HELP)] = "band-pass",
-    rows: Annotated[RowsName, typer.Option(help=ROWS_HELP)] = "grow",
+    detector: Detector = "band-pass",
+    rows: Rows = "grow",
 ) -> None:
     """Find the dots of one image and their rows and columns, without a set-up.
 

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from labapp.cli.shared import (
-    FRAMES_HELP,
-    FRAMES_METAVAR,
     INTERRUPTED,
     NOTHING_MEASURED,
-    RECORDING_HELP,
+    FrameRange,
+    Recording,
     finite,
     note,
     progress_bar,
@@ -33,10 +32,10 @@ if TYPE_CHECKING:
 
 
 def lines(
-    source: Annotated[Path, typer.Argument(help=RECORDING_HELP)],
+    source: Recording,
     setup: Annotated[Path, typer.Option(help='Setup file (TOML) with [pattern] kind = "lines".')],
     out: Annotated[Path, typer.Option(help="Folder for the tables; made if missing.")],
-    frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
+    frames: FrameRange = ":",
     follow: Annotated[
         bool,
         typer.Option(
@@ -134,9 +133,10 @@ def _write_measured(done: list[FrameResult], folder: Path, bench: Setup) -> bool
     from labapp.core.recording.residual_check import doubt_of_values, judged_status
     from labapp.export.line_results import line_tables, of_lines
 
-    frames, times_s, found = of_lines(done)
+    frames = of_lines(done)
+    found = [one.lines for one in frames]
     status = judged_status(bench.rig, doubt_of_values(bench.rig))
-    for name, text in line_tables(frames, times_s, found, bench.calibration, status).items():
+    for name, text in line_tables(frames, bench.calibration, status).items():
         write_file(folder / name, text.encode())
     series = LineSeries.of(found)
     states = line_states(series)
@@ -144,7 +144,7 @@ def _write_measured(done: list[FrameResult], folder: Path, bench: Setup) -> bool
         shown = ", ".join(f"{what} {n}" for what, n in Counter(counts).most_common())
         typer.echo(f"{name}: {shown}")
     for k, before, after in line_changes(series):
-        typer.echo(f"frame {frames[k]}: from {before} lines to {after}")
+        typer.echo(f"frame {frames[k].frame}: from {before} lines to {after}")
     return any(one.seen.lines for one in found)
 
 
@@ -156,14 +156,15 @@ def _write_followed(done: list[FrameResult], folder: Path) -> bool:
     from labapp.core.lines.track import oscillation_frequency
     from labapp.export import line_results as tables
 
-    frames, times_s, found = tables.of_lines(done)
-    rows = tables.track_rows(frames, times_s, found)
+    frames = tables.of_lines(done)
+    rows = tables.track_rows(frames)
     write_file(folder / "track.csv", csv_text([tables.TRACK_COLUMNS, *rows]).encode())
+    found = [one.lines for one in frames]
     on = np.array([one.status == "pulse" for one in found], bool)
     shift = np.array([np.nan if one.track is None else one.track.shift_px for one in found])
     known = np.isfinite(shift)
     typer.echo(f"{(~on).sum()} of {len(done)} frames are without a pulse; line in {known.sum()}")
-    time_s = np.array([np.nan if one is None else one for one in times_s])
+    time_s = np.array([np.nan if one.time_s is None else one.time_s for one in frames])
     step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else float("nan")
     hertz = pulse_frequency(on, 1 / step_s) if step_s > 0 else float("nan")
     if np.isfinite(hertz):

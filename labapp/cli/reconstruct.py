@@ -17,16 +17,13 @@ import typer
 from labapp.cli.shared import (
     ABOUT_SCHEMES,
     ALGORITHM_HELP,
-    DETECTOR_HELP,
-    FRAMES_HELP,
-    FRAMES_METAVAR,
     INTERRUPTED,
     NOTHING_MEASURED,
-    RECORDING_HELP,
-    ROWS_HELP,
     Algorithm,
-    DetectorName,
-    RowsName,
+    Detector,
+    FrameRange,
+    Recording,
+    Rows,
     SchemeName,
     SigmaParts,
     Warm,
@@ -57,7 +54,7 @@ Anywhere = Annotated[
 
 
 def reconstruct(
-    source: Annotated[Path, typer.Argument(help=RECORDING_HELP)],
+    source: Recording,
     setup: Annotated[Path, typer.Option(help="Setup file (TOML; mm, degrees, px).")],
     out: Annotated[
         Path,
@@ -77,9 +74,9 @@ def reconstruct(
         typer.Option(help="Order of dots relative to rays, columns/rows: same S, inverse I."),
     ] = "auto",
     *,
-    detector: Annotated[DetectorName, typer.Option(help=DETECTOR_HELP)] = "band-pass",
-    rows: Annotated[RowsName, typer.Option(help=ROWS_HELP)] = "grow",
-    frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
+    detector: Detector = "band-pass",
+    rows: Rows = "grow",
+    frames: FrameRange = ":",
     surfaces: Annotated[
         Literal["all", "none"], typer.Option(help="Write the surface of every frame, or of none.")
     ] = "all",

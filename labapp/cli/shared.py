@@ -55,14 +55,20 @@ TERMINATED, INTERRUPTED, FAULT, BAD_INPUT, NOTHING_MEASURED = 143, 130, 3, 2, 1
 RUNS_SHOWN = 6
 
 FRAMES_METAVAR = "A:B:STEP"
-RECORDING_HELP = (
-    "A video, an image, a folder of images, a TIFF or NumPy stack, a Phantom .cine, "
-    "a Photron .mraw or its header."
-)
 FRAMES_HELP = (
     "Frames A up to but not including B, from 0, every STEP-th; parts may be omitted. "
     "A alone: that frame. Negative: counted from the end."
 )
+
+SessionFile = Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")]
+Recording = Annotated[
+    Path,
+    typer.Argument(
+        help="A video, an image, a folder of images, a TIFF or NumPy stack, a Phantom .cine, "
+        "a Photron .mraw or its header."
+    ),
+]
+FrameRange = Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)]
 
 Warm = Annotated[
     bool,
@@ -77,6 +83,8 @@ DetectorName: TypeAlias = Literal["band-pass", "block-threshold", "wavelet"]
 RowsName: TypeAlias = Literal["grow", "rows", "masks"]
 DETECTOR_HELP = "How dots are found: band-pass, block threshold (§5.2.1), wavelet chain (§5.3)."
 ROWS_HELP = "How rows are found: grown from dot to dot, row search (§5.2.2), masks (§5.3)."
+Detector = Annotated[DetectorName, typer.Option(help=DETECTOR_HELP)]
+Rows = Annotated[RowsName, typer.Option(help=ROWS_HELP)]
 
 SigmaParts = Annotated[
     bool,

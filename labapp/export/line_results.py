@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,6 +39,20 @@ SURFACE_COLUMNS = ("x_mm", "y_mm", "z_mm", "z_sigma_mm")
 """``z_sigma_mm`` does not include the set-up either."""
 
 SPACING_MM = 0.1
+
+
+class FrameOfLines(NamedTuple):
+    """The lines of a frame that could be read."""
+
+    frame: int
+    time_s: float | None
+    lines: LineFrame
+
+
+def of_lines(results: Iterable[FrameResult]) -> list[FrameOfLines]:
+    """Return the frames that could be read."""
+    seen = ((one, one.measurement.lines) for one in results)
+    return [FrameOfLines(one.frame, one.time_s, lines) for one, lines in seen if lines is not None]
 
 
 def line_rows(frame: int, found: LineFrame, calibration: ImageCalibration) -> list[list[str]]:
@@ -81,15 +96,11 @@ def point_rows(frame: int, found: LineFrame, calibration: ImageCalibration) -> l
 
 
 def feature_rows(
-    frames: Sequence[int],
-    times_s: Sequence[float | None],
-    found: Sequence[LineFrame],
-    states: Sequence[State],
-    setup_status: str,
+    frames: Sequence[FrameOfLines], states: Sequence[State], setup_status: str
 ) -> list[list[str]]:
     """Return rows of ``features.csv``: one per frame."""
     rows = []
-    for frame, time_s, one, state in zip(frames, times_s, found, states, strict=True):
+    for (frame, time_s, one), state in zip(frames, states, strict=True):
         seen = one.features
         surface = one.surface if one.status == "ok" else None
         measured: tuple[float, ...] = (np.nan,) * 6
@@ -111,12 +122,10 @@ def feature_rows(
     return rows
 
 
-def track_rows(
-    frames: Sequence[int], times_s: Sequence[float | None], found: Sequence[LineFrame]
-) -> list[list[str]]:
+def track_rows(frames: Sequence[FrameOfLines]) -> list[list[str]]:
     """Return rows of ``track.csv``: one per frame of a followed line."""
     rows = []
-    for frame, time_s, one in zip(frames, times_s, found, strict=True):
+    for frame, time_s, one in frames:
         line = one.track
         shape = (
             [""] * 4
@@ -157,30 +166,13 @@ def _cell(value: float | None) -> str:
     return "" if value is None or not np.isfinite(value) else f"{value:.5f}"
 
 
-def of_lines(
-    results: Iterable[FrameResult],
-) -> tuple[list[int], list[float | None], list[LineFrame]]:
-    """Return numbers, times and lines of the frames that could be read."""
-    seen = [(one, one.measurement.lines) for one in results]
-    read = [(one, lines) for one, lines in seen if lines is not None]
-    return (
-        [one.frame for one, _ in read],
-        [one.time_s for one, _ in read],
-        [lines for _, lines in read],
-    )
-
-
 def line_tables(
-    frames: Sequence[int],
-    times_s: Sequence[float | None],
-    found: Sequence[LineFrame],
-    calibration: ImageCalibration,
-    setup_status: str,
+    frames: Sequence[FrameOfLines], calibration: ImageCalibration, setup_status: str
 ) -> dict[str, str]:
     """Return all tables of a recording's frames as CSV text, by file name."""
-    states = line_states(LineSeries.of(found))
-    numbered = list(zip(frames, found, strict=True))
-    features = feature_rows(frames, times_s, found, states, setup_status)
+    numbered = [(one.frame, one.lines) for one in frames]
+    states = line_states(LineSeries.of([one for _, one in numbered]))
+    features = feature_rows(frames, states, setup_status)
     lines = [row for k, one in numbered for row in line_rows(k, one, calibration)]
     points = [row for k, one in numbered for row in point_rows(k, one, calibration)]
     tables = {
@@ -188,9 +180,8 @@ def line_tables(
         "lines.csv": csv_text([LINE_COLUMNS, *lines]),
         "line_points.csv": csv_text([POINT_COLUMNS, *points]),
     }
-    if any(np.isfinite(one.pulse) for one in found):
-        rows = track_rows(frames, times_s, found)
-        tables["track.csv"] = csv_text([TRACK_COLUMNS, *rows])
+    if any(np.isfinite(one.pulse) for _, one in numbered):
+        tables["track.csv"] = csv_text([TRACK_COLUMNS, *track_rows(frames)])
     edges = [row for k, one in numbered if one.edges for row in edge_rows(k, one.edges)]
     if edges:
         tables["edges.csv"] = csv_text([EDGE_COLUMNS, *edges])

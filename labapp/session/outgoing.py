@@ -125,7 +125,7 @@ def _export_lines(
             yield result
             report_progress(done, len(numbers))
 
-    texts = line_tables(*of_lines(measured()), session.setup.calibration, session.setup_status)
+    texts = line_tables(of_lines(measured()), session.setup.calibration, session.setup_status)
     return export(
         folder,
         (),

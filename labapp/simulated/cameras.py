@@ -14,7 +14,6 @@ from labapp.errors import InputError
 from labapp.media import GreyImage, open_source
 from labapp.media.cameras import (
     Camera,
-    Faults,
     SimulatedDevice,
     open_camera,
     there_and_back,
@@ -54,11 +53,7 @@ def camera_opener(id: str, progress: Progress | None = None) -> Callable[[], Cam
     return partial(open_camera, id)
 
 
-def simulated_device(
-    path: Path,
-    progress: Progress | None = None,
-    faults: Faults | None = None,
-) -> SimulatedDevice:
+def simulated_device(path: Path, progress: Progress | None = None) -> SimulatedDevice:
     """Create a camera that plays a file; see `camera_opener`."""
     if path.suffix == ".toml":
         images, depth, rate_hz = _rendered(path, progress)
@@ -69,7 +64,6 @@ def simulated_device(
         there_and_back(images),
         bit_depth=depth,
         rate_hz=rate_hz or USUAL_HZ,
-        faults=faults,
     )
 
 

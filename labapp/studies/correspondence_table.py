@@ -8,7 +8,7 @@ from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser,
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.pools import spherical_cap
-from labapp.studies.tables import Table
+from labapp.studies.tables import Cell, Table
 
 RADII_MM, DEPTHS = (2, 3, 4, 5), (100, 50, 10, 5, 2)
 """Radius, and ratio of radius to depth, of the caps of Tables 4-4 and 4-5."""
@@ -33,21 +33,14 @@ def correspondence_tables() -> tuple[Table, Table]:
     """Tables 4-4 and 4-5: order of columns and rows; a star marks the sand timer of Fig. 4-18."""
     made = []
     for number, kind, sign in ((4, "concave", -1), (5, "convex", 1)):
-        rows = [
-            (
-                f"r/{part}",
-                *(correspondence_letters(cap_reflections(r, sign / part)) for r in RADII_MM),
-            )
-            for part in DEPTHS
-        ]
-        made.append(
-            Table(
-                f"table_4_{number}_correspondence_{kind}",
-                f"Table 4-{number}, column/row correspondence on {kind} surfaces",
-                ("depth", *(f"r{radius}" for radius in RADII_MM)),
-                tuple(rows),
-            )
-        )
+        rows = []
+        for part in DEPTHS:
+            row: dict[str, Cell] = {"depth": f"r/{part}"}
+            for radius in RADII_MM:
+                row[f"r{radius}"] = correspondence_letters(cap_reflections(radius, sign / part))
+            rows.append(row)
+        caption = f"Table 4-{number}, column/row correspondence on {kind} surfaces"
+        made.append(Table.of(f"table_4_{number}_correspondence_{kind}", caption, rows))
     return made[0], made[1]
 
 

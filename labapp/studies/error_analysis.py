@@ -190,18 +190,18 @@ def error_table(surveys: Sequence[ErrorSurvey]) -> Table:
         for letter, error in (("D", "depth"), ("B", "boundary")):
             for surface in ("convex", "concave", "all"):
                 published = TEXT.get((one.kind, letter, surface), (None, None))
-                row: list[Cell] = [f"{one.kind}-{letter}", surface]
+                row: dict[str, Cell] = {"error": f"{one.kind}-{letter}", "surface": surface}
                 for scheme in one.schemes:
                     values = 100 * one.of(scheme, error, surface)
-                    row += [float(np.nanmean(values)), float(np.nanmax(values))]
-                rows.append((*row, *(None if v is None else 100 * v for v in published)))
-    schemes = surveys[0].schemes
-    columns = [f"{scheme}_{what}_pct" for scheme in schemes for what in ("mean", "worst")]
-    return Table(
+                    row[f"{scheme}_mean_pct"] = float(np.nanmean(values))
+                    row[f"{scheme}_worst_pct"] = float(np.nanmax(values))
+                for what, value in zip(("mean", "worst"), published, strict=True):
+                    row[f"text_{what}_pct"] = None if value is None else 100 * value
+                rows.append(row)
+    return Table.of(
         "errors",
         "Errors of depth (D) and boundary (B) on the caps of §8.3.1, %; text: ERS, Fig. 8-6 … 8-10",
-        ("error", "surface", *columns, "text_mean_pct", "text_worst_pct"),
-        tuple(rows),
+        rows,
     )
 
 
@@ -214,45 +214,40 @@ def are_table(surveys: Sequence[ErrorSurvey]) -> Table:
                 computed = one.of(scheme, "are_mm", surface)
                 actual = one.of(scheme, "actual_are_mm", surface)
                 apart = np.abs(computed - actual)
-                found = [np.nanmean(computed), np.nanmean(actual), np.nanmin(apart)]
-                row = (one.kind, surface, scheme, *map(float, found), float(np.nanmax(apart)))
+                row: dict[str, Cell] = {
+                    "error": one.kind,
+                    "surface": surface,
+                    "scheme": scheme,
+                    "are_mm": float(np.nanmean(computed)),
+                    "actual_are_mm": float(np.nanmean(actual)),
+                    "least_difference_mm": float(np.nanmin(apart)),
+                    "largest_difference_mm": float(np.nanmax(apart)),
+                }
                 rows.append(row)
-    return Table(
+    return Table.of(
         "are",
         "Computed ARE (Eq. 6-3) and actual ARE (Eq. 8-4), mm; text (CE, ERS): "
         "0.0021 to 0.2543 mm apart",
-        (
-            "error",
-            "surface",
-            "scheme",
-            "are_mm",
-            "actual_are_mm",
-            "least_difference_mm",
-            "largest_difference_mm",
-        ),
-        tuple(rows),
+        rows,
     )
 
 
 def cap_table(surveys: Sequence[ErrorSurvey]) -> Table:
     """Every error of every cap by every scheme."""
-    rows: list[tuple[Cell, ...]] = [
-        (
-            *(one.kind, cap.footprint.width_mm, cap.peak_mm, scheme),
-            *map(float, one.errors[n, k]),
-            *cap.footprint.center_mm,
-        )
+    rows: list[dict[str, Cell]] = [
+        {
+            "error": one.kind,
+            "diameter_mm": cap.footprint.width_mm,
+            "height_mm": cap.peak_mm,
+            "scheme": scheme,
+            **dict(zip(ERRORS, map(float, one.errors[n, k]), strict=True)),
+            "center_x_mm": cap.footprint.center_mm[0],
+            "center_y_mm": cap.footprint.center_mm[1],
+        }
         for one in surveys
         for n, cap in enumerate(one.caps)
         for k, scheme in enumerate(one.schemes)
     ]
-    return Table(
-        "errors_by_cap",
-        "Errors of every cap: depth and boundary as fractions, ARE in mm",
-        (
-            *("error", "diameter_mm", "height_mm", "scheme"),
-            *ERRORS,
-            *("center_x_mm", "center_y_mm"),
-        ),
-        tuple(rows),
+    return Table.of(
+        "errors_by_cap", "Errors of every cap: depth and boundary as fractions, ARE in mm", rows
     )

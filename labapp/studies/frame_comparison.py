@@ -54,30 +54,19 @@ def shape_table(match: Match) -> Table:
     allowed = ALLOWED[shapes.shape] if shapes.shape else ()
     residual = {trial.orientation: trial.residual_mm for trial in match.trials}
     words = {True: "yes", False: "no", None: ""}
-    rows: list[tuple[Cell, ...]] = [
-        (
-            shapes.shape or "neither",
-            shapes.convex,
-            shapes.concave,
-            " ".join(allowed),
-            match.orientation,
-            *(residual.get(way) for way in ORIENTATIONS),
-            words[shapes.allows(match.orientation)],
-        )
-    ]
-    return Table(
+    row: dict[str, Cell] = {
+        "rows": shapes.shape or "neither",
+        "convex": shapes.convex,
+        "concave": shapes.concave,
+        "allowed_by_rows": " ".join(allowed),
+        "by_residual": match.orientation,
+        **{f"residual_{way.replace('/', '')}_mm": residual.get(way) for way in ORIENTATIONS},
+        "agree": words[shapes.allows(match.orientation)],
+    }
+    return Table.of(
         "section_7_1_row_shape",
         "Correspondence by the shape of the reflected rows (§7.1) and by the residual",
-        (
-            "rows",
-            "convex",
-            "concave",
-            "allowed_by_rows",
-            "by_residual",
-            *(f"residual_{way.replace('/', '')}_mm" for way in ORIENTATIONS),
-            "agree",
-        ),
-        tuple(rows),
+        [row],
     )
 
 

@@ -32,7 +32,7 @@ from labapp.studies.error_analysis import (
     trace_once,
 )
 from labapp.studies.parameter_deviation import KnownPool, nominal
-from labapp.studies.tables import Table
+from labapp.studies.tables import Cell, Table
 from labapp.text import pluralize
 
 TACK = spherical_cap(9.75, 0.91)
@@ -174,23 +174,21 @@ def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[str] = SCH
         for name, n, unit in (("height", 0, 100), ("diameter", 1, 100), ("ARE", 2, 1)):
             known = each[np.isfinite(each[:, n]), n] * unit
             text = published[n]
-            rows.append(
-                (
-                    scheme,
-                    f"{name}, {'%' if unit == 100 else 'mm'}",
-                    float(unit * exact[n]),
-                    float(known.mean()) if len(known) else None,
-                    float(known.max()) if len(known) else None,
-                    len(known),
-                    None if text is None else unit * text,
-                )
-            )
-    return Table(
+            row: dict[str, Cell] = {
+                "scheme": scheme,
+                "error": f"{name}, {'%' if unit == 100 else 'mm'}",
+                "exact": float(unit * exact[n]),
+                "frames_mean": float(known.mean()) if len(known) else None,
+                "frames_worst": float(known.max()) if len(known) else None,
+                "frames_measured": len(known),
+                "text": None if text is None else unit * text,
+            }
+            rows.append(row)
+    return Table.of(
         "measurement_error",
         f"Measurement error on the thumb tack of §8.2: exact reflections, and "
         f"{pluralize(len(frames), 'frame')}",
-        ("scheme", "error", "exact", "frames_mean", "frames_worst", "frames_measured", "text"),
-        tuple(rows),
+        rows,
     )
 
 
@@ -212,33 +210,23 @@ def image_error_table(
             continue
         off = np.concatenate([frame.off_px for frame in frames])
         right = off[off <= WRONG_PX]
-        dots = (
-            float(np.sqrt(np.mean(right**2))) if len(right) else None,
-            int(sum(frame.missed for frame in frames)),
-            int(sum(frame.wrong for frame in frames)),
-        )
+        dots: dict[str, Cell] = {
+            "dot_rms_px": float(np.sqrt(np.mean(right**2))) if len(right) else None,
+            "dots_missed": int(sum(frame.missed for frame in frames)),
+            "labels_wrong": int(sum(frame.wrong for frame in frames)),
+        }
         for k, scheme in enumerate(schemes):
             added = 100 * np.abs([frame.errors[k] - frame.exact[k] for frame in frames])
             known = added[np.isfinite(added[:, 0])]
-            sizes: list[float | None] = [None] * 4
-            if len(known):
-                sizes = [float(v) for n in (0, 1) for v in (known[:, n].mean(), known[:, n].max())]
-            rows.append((surface, scheme, len(frames), len(known), *sizes, *dots))
-    return Table(
+            sizes = {
+                f"{size}_{what}_pct": float(of(known[:, n])) if len(known) else None
+                for n, size in enumerate(("height", "diameter"))
+                for what, of in (("mean", np.mean), ("worst", np.max))
+            }
+            counts = {"frames": len(frames), "measured": len(known)}
+            rows.append({"surface": surface, "scheme": scheme, **counts, **sizes, **dots})
+    return Table.of(
         "image_processing_error",
         "Image processing error on the caps of §8.3.1: what rendered frames add, %; dots",
-        (
-            "surface",
-            "scheme",
-            "frames",
-            "measured",
-            "height_mean_pct",
-            "height_worst_pct",
-            "diameter_mean_pct",
-            "diameter_worst_pct",
-            "dot_rms_px",
-            "dots_missed",
-            "labels_wrong",
-        ),
-        tuple(rows),
+        rows,
     )

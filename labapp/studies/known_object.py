@@ -5,6 +5,8 @@ Its boundary is a circle, for the schemes with a boundary model (§8.2.1).
 
 from __future__ import annotations
 
+import math
+
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import reconstruct
@@ -50,39 +52,32 @@ def known_object_table(match: Match, rig: Rig, cap: Pool) -> Table:
     Table
         One row per scheme; empty cells if it finds no surface.
     """
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[dict[str, Cell]] = []
     diameter_mm, height_mm = cap.footprint.width_mm, cap.peak_mm
     for scheme in SCHEME_NAMES:
+        status, are_mm, height, diameter = "ok", math.nan, math.nan, math.nan
         try:
             made = reconstruct(match, rig, circle_settings(scheme))
         except CannotMeasure as why:
-            rows.append((scheme, why.status, *[None] * 5))
-            continue
-        measures = measure_surface(made, match, rig)
-        height, diameter = relative_errors(measures, cap)
+            status = why.status
+        else:
+            measures = measure_surface(made, match, rig)
+            height, diameter = relative_errors(measures, cap)
+            are_mm = computed_are(measures)
         rows.append(
-            (
-                scheme,
-                "ok",
-                diameter_mm * (1 + diameter),
-                100 * abs(diameter),
-                height_mm * (1 + height),
-                100 * abs(height),
-                computed_are(measures),
-            )
+            {
+                "scheme": scheme,
+                "status": status,
+                "diameter_mm": diameter_mm * (1 + diameter),
+                "diameter_error_pct": 100 * abs(diameter),
+                "height_mm": height_mm * (1 + height),
+                "height_error_pct": 100 * abs(height),
+                "are_mm": are_mm,
+            }
         )
-    return Table(
+    return Table.of(
         "section_8_2_known_object",
         f"Measurement error on an object of diameter {diameter_mm:g} and height {height_mm:g} mm "
         "(§8.2, circle model)",
-        (
-            "scheme",
-            "status",
-            "diameter_mm",
-            "diameter_error_pct",
-            "height_mm",
-            "height_error_pct",
-            "are_mm",
-        ),
-        tuple(rows),
+        rows,
     )

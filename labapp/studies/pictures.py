@@ -19,6 +19,7 @@ from labapp.simulation.render import RenderedFrame
 from labapp.studies.error_analysis import ErrorSurvey
 from labapp.studies.plotting import INCHES, new_figure, row_colour
 from labapp.studies.positioning_tables import Coverage
+from labapp.studies.side_picture import draw_side
 
 STYLES = (
     *(("#1b7a3d", "^"), ("#1b4f8a", "o"), ("#c05a00", "s")),
@@ -29,13 +30,6 @@ STYLES = (
 STYLE_OF = dict(zip(SCHEMES, itertools.cycle(STYLES), strict=False))
 COLOURS = {name: colour for name, (colour, _) in STYLE_OF.items()}
 COLOURS |= {"predicted": "#8ab0d8", "simulated": "#1b4f8a"}
-FATES = {
-    Fate.CAUGHT: "#1b7a3d",
-    Fate.PAST: "#c05a00",
-    Fate.BLOCKED: "#b01030",
-    Fate.UNUSED: "0.8",
-}
-
 
 PLATE_MM = 101.6
 """Edge of the imaging plane of Fig. 4-11."""
@@ -52,7 +46,7 @@ def positioning_picture(rig: Rig, width_mm: float, length_mm: float, height_mm: 
             plots, ("flat", "convex", "concave"), (0.0, height_mm, -height_mm), strict=True
         ):
             view = side_view(rig, width_mm, length_mm, height)
-            _draw_side(plot, view)
+            _draw_room(plot, view)
             c = view.clearance
             blocked = view.tally[Fate.BLOCKED]
             plot.set_title(
@@ -65,24 +59,15 @@ def positioning_picture(rig: Rig, width_mm: float, length_mm: float, height_mm: 
         return figure
 
 
-def _draw_side(plot: Any, view: SideView) -> None:
-    labelled: set[Fate] = set()
-    for ray in view.rays:
-        label = None if ray.fate in labelled else ray.fate.value
-        labelled.add(ray.fate)
-        plot.plot(*ray.path_mm.T, color=FATES[ray.fate], lw=0.6, label=label)
-    plot.axhline(0, color="0.3", lw=0.6)
-    plot.plot(*view.pool_mm.T, color="#c05a00", lw=1.6)
-    plot.plot(*view.plane_mm.T, "k", lw=1.8)
-    plot.plot(*view.laser_mm, "ks", ms=4)
-    tip = view.tip_mm[1]
-    plot.fill([0, 1.2, 1.2, -1.2, -1.2], [tip, tip + 4, 40, 40, tip + 4], "0.7", ec="0.3", lw=0.5)
+def _draw_room(plot: Any, view: SideView) -> None:
+    """Draw the bench with L1 and L2."""
+    draw_side(plot, view)
     for place, name in ((-view.clearance.l1_mm, "L1"), (view.clearance.l2_mm, "L2")):
         if np.isfinite(place):
             plot.plot([place, place], [-1.5, 1.5], "k", lw=0.8)
             plot.annotate(name, (place, -1.5), (0, -8), textcoords="offset points", ha="center")
     low = view.plane_mm[:, 0].min()
-    plot.set(xlim=(low - 3, view.laser_mm[0] + 4), ylim=(-5, 40), aspect="equal", ylabel="Z (mm)")
+    plot.set(xlim=(low - 3, view.laser_mm[0] + 4), ylim=(-5, 40))
 
 
 def coverage_picture(placements: Sequence[Coverage]) -> Figure:

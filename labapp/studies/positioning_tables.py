@@ -33,18 +33,14 @@ def blocking_tables() -> tuple[Table, Table]:
     """Tables 4-1 and 4-2: `rb` if the torch blocks a reflected ray, `ib` for an incident one."""
     made = []
     for number, kind, sign in ((1, "convex", 1), (2, "concave", -1)):
-        rows: list[tuple[Cell, ...]] = [
-            (angle, *(_blocking(angle, radius, sign * depth) for radius, depth in SIZES_MM))
-            for angle in ANGLES_DEG
-        ]
-        made.append(
-            Table(
-                f"table_4_{number}_blocking_{kind}",
-                f"Table 4-{number}, blocking on {kind} surfaces",
-                ("projection_angle_deg", *(f"r{radius}_d{depth:g}" for radius, depth in SIZES_MM)),
-                tuple(rows),
-            )
-        )
+        rows = []
+        for angle in ANGLES_DEG:
+            row: dict[str, Cell] = {"projection_angle_deg": angle}
+            for radius, depth in SIZES_MM:
+                row[f"r{radius}_d{depth:g}"] = _blocking(angle, radius, sign * depth)
+            rows.append(row)
+        name = f"table_4_{number}_blocking_{kind}"
+        made.append(Table.of(name, f"Table 4-{number}, blocking on {kind} surfaces", rows))
     return made[0], made[1]
 
 
@@ -78,21 +74,20 @@ def clearance_table() -> Table:
     for angle in ANGLES_DEG:
         for surface, slope in surfaces.items():
             found = clearance(positioning_rig(angle), slope)
-            d1 = found.least_plane_mm + 0.0, found.most_plane_mm + 0.0
-            rows.append((angle, surface, slope, found.l1_mm, found.l2_mm, *d1))
-    return Table(
+            row: dict[str, Cell] = {
+                "projection_angle_deg": angle,
+                "surface": surface,
+                "head_slope_deg": slope,
+                "l1_mm": found.l1_mm,
+                "l2_mm": found.l2_mm,
+                "d1_least_mm": found.least_plane_mm + 0.0,
+                "d1_most_mm": found.most_plane_mm + 0.0,
+            }
+            rows.append(row)
+    return Table.of(
         "l1_l2_d1",
         "L1, L2 and D1 (Eq. 4-14 … 4-18): laser 30 mm away, electrode 5 mm, plane 0 to 101.6 mm up",
-        (
-            "projection_angle_deg",
-            "surface",
-            "head_slope_deg",
-            "l1_mm",
-            "l2_mm",
-            "d1_least_mm",
-            "d1_most_mm",
-        ),
-        tuple(rows),
+        rows,
     )
 
 
@@ -120,13 +115,14 @@ def coverage() -> tuple[Coverage, ...]:
 
 def coverage_table(placements: tuple[Coverage, ...]) -> Table:
     """Number of dots on the 4″ plane and off it."""
-    rows = [
-        (one.distance_mm, len(one.on_plane), int(one.on_plane.sum()), int((~one.on_plane).sum()))
+    rows: list[dict[str, Cell]] = [
+        {
+            "plane_distance_mm": one.distance_mm,
+            "reflected_dots": len(one.on_plane),
+            "on_plane": int(one.on_plane.sum()),
+            "off_plane": int((~one.on_plane).sum()),
+        }
         for one in placements
     ]
-    return Table(
-        "figure_4_11_coverage",
-        "Fig. 4-11, dots on the 4″ plane: convex cap 3/0.3, laser at 30°, 30 mm",
-        ("plane_distance_mm", "reflected_dots", "on_plane", "off_plane"),
-        tuple(rows),
-    )
+    caption = "Fig. 4-11, dots on the 4″ plane: convex cap 3/0.3, laser at 30°, 30 mm"
+    return Table.of("figure_4_11_coverage", caption, rows)

@@ -61,16 +61,14 @@ class SetupBudget(ReadOnlyArrays):
         return not predicted and self.lost == len(self.random)
 
 
-def predicted_budget(
-    rig: Rig, pool: Pool, progress: Progress | None = None, workers: int | None = None
-) -> SetupBudget:
+def predicted_budget(rig: Rig, pool: Pool, progress: Progress | None = None) -> SetupBudget:
     """Predict and simulate the error budget of a rig with uncertainty for a kind of pool."""
     known, exact = rig.uncertainty, replace(rig, uncertainty=None)
     assert known is not None
     rng = np.random.default_rng(831)
     pools = [similar_pool(pool, rng) for _ in range(POOLS)]
     tasks = [(exact, known, one, k) for k, one in enumerate(pools)]
-    found = in_parallel(_simulated, tasks, "budget", progress, workers)
+    found = in_parallel(_simulated, tasks, "budget", progress)
     moved = np.array([changes for _, _, changes in found[:MOVED_POOLS]])
     return SetupBudget(
         pool=pool,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Self
 
 from labapp.text import csv_text
 
@@ -22,6 +24,13 @@ class Table:
     """Names of the columns, including units."""
     rows: tuple[tuple[Cell, ...], ...]
     """Cells; None or NaN if a value is unknown."""
+
+    @classmethod
+    def of(cls, name: str, caption: str, rows: Iterable[Mapping[str, Cell]]) -> Self:
+        """Table of rows, at least one, that each have the same columns: name → cell."""
+        first, *others = rows
+        cells = (tuple(row[column] for column in first) for row in (first, *others))
+        return cls(name, caption, tuple(first), tuple(cells))
 
     def csv(self) -> str:
         """CSV with a header row; an unknown value is an empty cell."""

@@ -19,10 +19,9 @@ from labapp.media.cameras import (
     BrokenFrame,
     CameraFrame,
     CameraLost,
-    Faults,
-    SimulatedDevice,
 )
 from labapp.media.cameras.simulated import SimulatedCamera
+from tests.media.cameras.faulty import Faults, FaultyCamera, FaultyDevice
 
 BITS = 32
 """A frame's number is in the lowest bits of as many pixels of its first row, invisibly."""
@@ -75,7 +74,7 @@ class Truth:
         self.frames += 1
 
 
-class FilmedDevice(SimulatedDevice):
+class FilmedDevice(FaultyDevice):
     """A simulated camera with numbered frames and a record of them.
 
     Parameters
@@ -114,7 +113,7 @@ class FilmedDevice(SimulatedDevice):
         return _FilmedCamera(self, self.truth)
 
 
-class _FilmedCamera(SimulatedCamera):
+class _FilmedCamera(FaultyCamera):
     def __init__(self, device: FilmedDevice, truth: Truth) -> None:
         super().__init__(device)
         self._truth, self._shape = truth, device.sensor[::-1]

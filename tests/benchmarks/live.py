@@ -51,13 +51,14 @@ from labapp.gui.live import live as live_module
 from labapp.gui.live import view as live_view
 from labapp.gui.preferences import Preferences
 from labapp.gui.shell.commands import make_window
-from labapp.media.cameras import CameraFrame, Faults
+from labapp.media.cameras import CameraFrame
 from labapp.media.recording.nut import NutWriter
 from labapp.media.recording.recorder import Recorder
 from labapp.media.recording.take_files import Take
 from labapp.run.live_measuring import LiveMeasuring
 from labapp.session.samples import sample_folder
 from labapp.session.session import Session
+from tests.media.cameras.faulty import Faults
 
 LEAST_UPDATES = 20.0
 """Least updates of the window per second, in every minute."""

@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from labapp.media import GreyImage, open_source
-from labapp.media.cameras import CameraSettings, Faults, Feed, SimulatedDevice
+from labapp.media.cameras import CameraSettings, Feed
 from labapp.media.recording.nut import Codec, NutWriter
 from labapp.media.recording.recorder import Plan, Recorder
 from labapp.session.samples import sample_folder
+from tests.media.cameras.faulty import Faults, FaultyDevice
 
 WRITTEN = 400
 
@@ -62,7 +63,7 @@ def film(
 ) -> None:
     """Record a simulated camera, and print lost frames and memory."""
     seconds, rate_hz = duration_and_rate
-    device = SimulatedDevice("camera", lambda k: images[k % len(images)], faults=faults)
+    device = FaultyDevice("camera", lambda k: images[k % len(images)], faults=faults)
     path = folder / "film.nut"
     events: list[str] = []
     with Recorder(

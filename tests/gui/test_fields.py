@@ -8,6 +8,7 @@ from PySide6.QtGui import QGuiApplication
 
 from labapp.gui.digits import NOTHING, ResultRow, as_csv, entered, parsed, plain, rounded
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
+from labapp.gui.widgets.labels import heading
 from labapp.gui.widgets.path_field import PathField, PathLine
 from labapp.gui.widgets.result_table import ResultTable
 
@@ -276,7 +277,7 @@ def test_form_aligns_label_editor_and_unit(qtbot):
         NumberField("A", "mm", lowest=0, highest=1, tooltip="first"),
         NumberField("A long label that wraps", "degrees", lowest=0, highest=1, tooltip="second"),
     ]
-    form.add_heading("Group")
+    form.add(heading("Group"))
     for field in fields:
         form.add(field)
     form.resize(360, 200)

@@ -14,13 +14,14 @@ import pytest
 
 from labapp.errors import InputError
 from labapp.media import GreyImage, open_source
-from labapp.media.cameras import CameraFrame, Faults, Feed, SimulatedDevice, feed
+from labapp.media.cameras import CameraFrame, Feed, feed
 from labapp.media.events import Event
 from labapp.media.recording import recorder as recorder_module
 from labapp.media.recording.nut import NutWriter
 from labapp.media.recording.recorder import Plan, Recorder, recording_path
 from labapp.media.recording.take_files import Take
 from labapp.session.session import Session
+from tests.media.cameras.faulty import Faults, FaultyDevice
 from tests.media.cameras.watching import Events, number_in, numbered
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -400,7 +401,7 @@ def test_recording_survives_unplugging_garbage_and_a_stalled_disk(
 ) -> None:
     monkeypatch.setattr(feed, "RETRY_S", (0.01,))
     faults = Faults(garbage=0.01, unplug_every=30, unplugged_s=0.03, stall_every=400, seed=9)
-    device = SimulatedDevice("test", numbered, rate_hz=1000, faults=faults)
+    device = FaultyDevice("test", numbered, rate_hz=1000, faults=faults)
     disk = Disk(tmp_path / "disk.nut")
     events = Events()
     passed_on: list[int] = []

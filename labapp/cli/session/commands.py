@@ -20,13 +20,15 @@ from labapp.cli.shared import (
     FRAMES_HELP,
     FRAMES_METAVAR,
     NOTHING_MEASURED,
-    RECORDING_HELP,
     ROWS_HELP,
     Algorithm,
     DetectorName,
+    FrameRange,
+    Recording,
     ResultsName,
     RowsName,
     SchemeName,
+    SessionFile,
     SigmaParts,
     Warm,
     choose_frames,
@@ -53,7 +55,6 @@ if TYPE_CHECKING:
 
 app = command_group()
 
-File = Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")]
 Frames = Annotated[
     str | None, typer.Option(metavar=FRAMES_METAVAR, help=f"{FRAMES_HELP} Default: all.")
 ]
@@ -140,7 +141,7 @@ def new(
 
 @app.command("setup")
 def set_setup(
-    file: File,
+    file: SessionFile,
     setup: Annotated[Path, typer.Argument(help="Setup file (TOML; mm, degrees, px).")],
 ) -> None:
     """Replace the set-up: rig and image calibration. This can be undone."""
@@ -156,12 +157,9 @@ def set_setup(
 
 @app.command("import")
 def import_recording(
-    file: File,
-    recording: Annotated[
-        Path,
-        typer.Argument(help=RECORDING_HELP),
-    ],
-    frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
+    file: SessionFile,
+    recording: Recording,
+    frames: FrameRange = ":",
     frame_rate: Annotated[
         float | None,
         typer.Option(
@@ -213,7 +211,7 @@ INEXACT = (
 
 @app.command()
 def relink(
-    file: File, recording: Annotated[Path, typer.Argument(help="New path of the recording.")]
+    file: SessionFile, recording: Annotated[Path, typer.Argument(help="New path of the recording.")]
 ) -> None:
     """Set the new path of a moved recording. Only the imported recording is accepted."""
     from labapp.session.session import Session
@@ -225,7 +223,7 @@ def relink(
 
 @app.command()
 def measure(
-    file: File,
+    file: SessionFile,
     frames: Frames = None,
     everything: Annotated[
         bool, typer.Option("--all", help="All frames, including those with current measures.")
@@ -301,20 +299,20 @@ app.command(cls=InOrder)(correct)
 
 
 @app.command()
-def undo(file: File) -> None:
+def undo(file: SessionFile) -> None:
     """Undo the last change of set-up, calibration, settings, dots or rows."""
     _step(file, "undo")
 
 
 @app.command()
-def redo(file: File) -> None:
+def redo(file: SessionFile) -> None:
     """Redo the change that was undone last."""
     _step(file, "redo")
 
 
 @app.command()
 def export(
-    file: File,
+    file: SessionFile,
     out: Annotated[
         Path,
         typer.Option(help="Folder for the results: new, empty, or an earlier export, replaced."),
@@ -409,7 +407,7 @@ app.command()(info)
 
 @app.command()
 def checklist(
-    file: File,
+    file: SessionFile,
     tick: Annotated[
         list[int] | None, typer.Option(min=1, help="Tick the item of this number; repeat for more.")
     ] = None,
@@ -446,7 +444,7 @@ def checklist(
 
 @app.command()
 def verify(
-    file: File,
+    file: SessionFile,
     recording: Annotated[
         bool, typer.Option(help="Also read all of the recording, or of the stored frames.")
     ] = True,

@@ -9,13 +9,12 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from itertools import repeat
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
-from labapp.cli.shared import frames_text, measure_frames, report_stale_results
+from labapp.cli.shared import SessionFile, frames_text, measure_frames, report_stale_results
 from labapp.errors import InputError
 from labapp.text import pluralize
 
@@ -94,7 +93,7 @@ Automatic = Annotated[
 
 def correct(
     context: typer.Context,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")],
+    file: SessionFile,
     *,
     frame: Annotated[int, typer.Option(min=0, help="Frame, by its number in the recording.")],
     dots: Dots = None,

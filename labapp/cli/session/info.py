@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 from collections import Counter
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from labapp.cli.shared import frames_text
+from labapp.cli.shared import SessionFile, frames_text
 from labapp.text import pluralize
 
 if TYPE_CHECKING:
@@ -20,7 +19,7 @@ NOT_MEASURED = "not measured"
 
 
 def info(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")],
+    file: SessionFile,
     as_json: Annotated[bool, typer.Option("--json", help="As JSON, for programs.")] = False,
     history: Annotated[
         bool, typer.Option("--history", help="Also list the changes that can be undone or redone.")

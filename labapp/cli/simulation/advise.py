@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from labapp.studies.adviser.expected_pools import ExpectedPools
 
 
+def _range(text: str) -> Any:
+    return typer.Option(metavar="A:B", help=text)
+
+
 def advise(
     *,
     out: Annotated[
@@ -25,28 +29,16 @@ def advise(
         Path | None,
         typer.Argument(metavar="FILE.toml", help="Pools and bench (TOML): docs/adviser.md."),
     ] = None,
-    width: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Width of the pools (X), from A to B (mm).")
-    ] = None,
-    length: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Length of the pools (Y) (mm).")
-    ] = None,
-    height: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Height of the pools, a magnitude (mm).")
-    ] = None,
+    width: Annotated[str | None, _range("Width of the pools (X), from A to B (mm).")] = None,
+    length: Annotated[str | None, _range("Length of the pools (Y) (mm).")] = None,
+    height: Annotated[str | None, _range("Height of the pools, a magnitude (mm).")] = None,
     convex: Annotated[
         bool | None,
         typer.Option("--convex/--concave", help="Kind of the pools. Default: convex."),
     ] = None,
-    angle: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Range of the laser's angle (degrees).")
-    ] = None,
-    distance: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Range of the laser's distance (mm).")
-    ] = None,
-    plane: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Distance of the imaging plane (mm).")
-    ] = None,
+    angle: Annotated[str | None, _range("Range of the laser's angle (degrees).")] = None,
+    distance: Annotated[str | None, _range("Range of the laser's distance (mm).")] = None,
+    plane: Annotated[str | None, _range("Distance of the imaging plane (mm).")] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Search more coarsely, in a tenth of the time.")
     ] = False,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
@@ -52,8 +53,7 @@ def positioning(out: Out = None, tables: Tables = False, picture: Format = "png"
 
     placements = study.coverage()
     computed = (*study.blocking_tables(), study.clearance_table(), study.coverage_table(placements))
-    folder = results_folder(out, tables)
-    _write(folder, AnalysisPart(computed, {}, computed if tables else ()))
+    folder = _write_tables(out, tables, computed)
     if folder is not None:
         from labapp.studies import pictures
 
@@ -69,8 +69,7 @@ def correspondence(out: Out = None, tables: Tables = False, picture: Format = "p
     from labapp.studies import correspondence_table as study
 
     computed = study.correspondence_tables()
-    folder = results_folder(out, tables)
-    _write(folder, AnalysisPart(computed, {}, computed if tables else ()))
+    folder = _write_tables(out, tables, computed)
     if folder is not None:
         from labapp.studies import pictures
 
@@ -173,13 +172,10 @@ def frame(
     if found.match is None:
         typer.echo(f"{source}: {found.status}: {found.reason}", err=True)
         raise typer.Exit(NOTHING_MEASURED)
-    computed: tuple[Table, ...] = (
-        shape_table(found.match),
-        *comparison_tables(found.match, known.rig),
-    )
+    computed = [shape_table(found.match), *comparison_tables(found.match, known.rig)]
     if cap is not None:
-        computed = (known_object_table(found.match, known.rig, cap), *computed)
-    _write(results_folder(out, tables), AnalysisPart(computed, {}, computed if tables else ()))
+        computed.insert(0, known_object_table(found.match, known.rig, cap))
+    _write_tables(out, tables, computed)
 
 
 @app.command()
@@ -215,6 +211,13 @@ def _chosen(option: str, requested: list[str] | None, known: tuple[T, ...]) -> t
         if name not in known:
             raise InputError(f"--{option}", option, name, f"one of {', '.join(known)}")
     return tuple(name for name in known if name in (requested or known))
+
+
+def _write_tables(out: Path | None, printed: bool, tables: Sequence[Table]) -> Path | None:
+    """Write tables, and print them if requested; returns the folder."""
+    folder = results_folder(out, printed)
+    _write(folder, AnalysisPart(tuple(tables), {}, tuple(tables) if printed else ()))
+    return folder
 
 
 def _write(folder: Path | None, part: AnalysisPart) -> None:

@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 
 from PySide6.QtCore import QObject, Signal
-from PySide6.QtWidgets import QWidget
 
 from labapp.config.setup_text import frame_px_of, three_points
 from labapp.errors import InputError
@@ -17,7 +16,7 @@ from labapp.gui.shell.steps import calibrations_in_use
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import selectable_label, show_words
-from labapp.gui.widgets.layouts import hbox
+from labapp.gui.widgets.layouts import row_of
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
 from labapp.session.record import Recording
 from labapp.session.session import Session
@@ -79,11 +78,8 @@ class CameraFields(QObject):
     def _make_buttons(self, form: FieldForm) -> None:
         self.whole_button = button("Full sensor", "Read all of the sensor again", self._set_whole)
         self.shoot_button = button("Take a frame", "Take one frame now", self._take_frame)
-        buttons = QWidget()
-        hbox(self.shoot_button, self.whole_button, of=buttons)
-        form.add_wide(buttons)
         self.part_words = selectable_label()
-        form.add_wide(self.part_words)
+        form.add(row_of(self.shoot_button, self.whole_button), self.part_words)
 
     # --- what the camera is set to ------------------------------------------------------------
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from PySide6.QtCore import QObject, Signal
 from PySide6.QtWidgets import QCheckBox
 
-from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import selectable_label
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, whole
+from labapp.gui.widgets.labels import heading, selectable_label
 from labapp.media.recording.nut import Codec
 from labapp.media.recording.recorder import Plan
 from labapp.text import format_bytes
@@ -30,7 +30,7 @@ class PlanFields(QObject):
 
     def __init__(self, form: FieldForm) -> None:
         super().__init__(form)
-        form.add_heading("Recording")
+        form.add(heading("Recording"))
         self.before = NumberField(
             "Before the trigger",
             "s",
@@ -49,13 +49,8 @@ class PlanFields(QObject):
             optional=True,
             tooltip="How long after the trigger the recording ends; empty: when you end it",
         )
-        self.every = NumberField(
-            "Every n-th frame",
-            lowest=1,
-            highest=10_000,
-            decimals=0,
-            tooltip="1: every frame is recorded; 2: every second one…",
-        )
+        tip = "1: every frame is recorded; 2: every second one…"
+        self.every = whole("Every n-th frame", 1, tip, 10_000)
         self.every.set_value(1)
         self.codec = ChoiceField(
             "Written as",
@@ -72,9 +67,8 @@ class PlanFields(QObject):
             "the background, each from the one before; the bar below shows how far that is"
         )
         self.measured.setChecked(True)
-        form.add_wide(self.measured)
         self.cost = selectable_label()
-        form.add_wide(self.cost)
+        form.add(self.measured, self.cost)
 
     def plan(self) -> Plan:
         """The plan in the fields."""

@@ -10,7 +10,7 @@ from PySide6.QtWidgets import QCheckBox, QGridLayout, QWidget
 from labapp.errors import InputError
 from labapp.gui.tasks import Control, Task
 from labapp.gui.widgets.buttons import check_box
-from labapp.gui.widgets.fields import NumberField
+from labapp.gui.widgets.fields import NumberField, whole
 from labapp.gui.widgets.labels import Message, selectable_label, show_words
 from labapp.gui.widgets.layouts import Group, vbox
 from labapp.gui.workspace import Workspace
@@ -59,9 +59,7 @@ class LiveStreams(QWidget):
         grid.setColumnStretch(3, 1)
         for row, (kind, (words, port, tip)) in enumerate(KINDS.items()):
             box = self.boxes[kind] = check_box(words, tip, partial(self._switch, kind))
-            field = self.ports[kind] = NumberField(
-                "port", lowest=1024, highest=65_535, decimals=0, tooltip=f"Port of {words}"
-            )
+            field = self.ports[kind] = whole("port", 1024, f"Port of {words}", 65_535)
             field.editor.setAccessibleName(f"Port of {words}")
             field.set_value(port)
             field.editor.setMinimumWidth(1)  # a wider one would be cut off

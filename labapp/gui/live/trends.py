@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QBoxLayout, QGridLayout, QSizePolicy, QWidget
 from labapp.errors import InputError
 from labapp.gui.curves import PLAIN, Axis, Curve, Mark
 from labapp.gui.views.plots import PlotStack
-from labapp.gui.widgets.fields import FieldForm, NumberField
+from labapp.gui.widgets.fields import FieldForm, NumberField, whole
 from labapp.gui.widgets.labels import plain_label
 from labapp.gui.widgets.layouts import scrolled, vbox
 from labapp.gui.widgets.parts import PartsBar
@@ -78,25 +78,14 @@ class LiveTrends(QWidget):
         self._workspace = workspace
         self.plots = PlotStack("Trends of the live pool")
         self.plots.area.setMinimumHeight(LEAST_PX)
-        self.last = NumberField(
-            "Shown, the last",
-            "s",
-            lowest=2,
-            highest=TREND_S,
-            decimals=0,
-            step=10,
-            tooltip="How much of the trend is shown",
-        )
+        tip = "How much of the trend is shown"
+        self.last = whole("Shown, the last", 2, tip, int(TREND_S), unit="s", step=10)
         self.last.set_value(LAST_S)
-        self.unmeasured = NumberField(
-            "Alarm after, not measured",
-            "frames",
-            lowest=1,
-            highest=10_000,
-            decimals=0,
-            tooltip="How many frames in a row that cannot be measured raise an alarm, where there "
-            "is any limit",
+        tip = (
+            "How many frames in a row that cannot be measured raise an alarm, where there is any "
+            "limit"
         )
+        self.unmeasured = whole("Alarm after, not measured", 1, tip, 10_000, unit="frames")
         self.unmeasured.edited.connect(lambda value: self._keep(unmeasured=int(value)))
         self.fields = {
             (name, end): NumberField(
@@ -141,8 +130,7 @@ class LiveTrends(QWidget):
         return grid
 
     def _others(self) -> FieldForm:
-        form = FieldForm()
-        form.add(self.last, self.unmeasured)
+        form = FieldForm(self.last, self.unmeasured)
         form.setMinimumWidth(form.minimumSizeHint().width())
         return form
 

@@ -6,9 +6,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-import pyqtgraph as pg
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
-from PySide6.QtWidgets import QWidget
 
 from labapp.core.images.exposure import Exposure
 from labapp.core.quality import Quality
@@ -28,12 +26,12 @@ from labapp.gui.live.penetration import LivePenetration
 from labapp.gui.live.plan_fields import PlanFields
 from labapp.gui.live.record_bar import RecordBar
 from labapp.gui.tasks import DONE, PROBLEM, Control, Task
-from labapp.gui.views.picture import PictureView
+from labapp.gui.views.picture import PictureView, rings
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.exposure import ExposureBars
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
 from labapp.gui.widgets.labels import Message, allow
-from labapp.gui.widgets.layouts import Group, hbox, vbox
+from labapp.gui.widgets.layouts import Group, column_of, hbox
 from labapp.gui.workspace import Workspace
 from labapp.media.cameras import (
     Camera,
@@ -61,10 +59,6 @@ SLOW_MS = 300
 
 STATUS_S = 0.2
 """Minimum interval of updates of the figures."""
-
-RING, RING_PX = "#2fd39b", 15
-"""Rings around detected dots: a colour of the dots page; diameter in points of the screen."""
-
 
 START = "Show live what the camera sees"
 
@@ -108,9 +102,7 @@ class LiveView(QObject):
         self._result: LiveResult | None = None
         self._timer = QTimer(self, interval=TICK_MS)
         self._timer.timeout.connect(self._tick)
-        self._rings = pg.ScatterPlotItem(
-            size=RING_PX, pxMode=True, pen=pg.mkPen(RING, width=1.2), brush=None
-        )
+        self._rings = rings()
         self._rings.hide()
         picture.add(self._rings)
         self.canvas = LiveCanvas(workspace, picture, self._watch, self.acknowledge)
@@ -445,7 +437,6 @@ class LiveView(QObject):
         self.bar.show_recording(recording)
 
     def _make_group(self) -> None:
-        form = FieldForm()
         self._choices = choices([])
         self.camera = ChoiceField(
             "Camera",
@@ -453,7 +444,6 @@ class LiveView(QObject):
             tooltip="Which camera to watch; the simulated one films a pool on this bench",
         )
         self.camera.edited.connect(lambda _: self._show_state())
-        form.add(self.camera)
         self.start_button = button("Start", START, self.start)
         self.find_button = button("Find cameras", "List the cameras that are connected", self.find)
         self.answer, self.counts = Message(2), Message(2)
@@ -465,10 +455,9 @@ class LiveView(QObject):
         self.camera_fields.reset.connect(self._begin_anew)
         self.plan_fields = PlanFields(fields)
         self.plan_fields.edited.connect(self._replan)
-        self.settings = QWidget()
-        vbox(self.figures, self.penetration, self.counts, fields, of=self.settings)
+        self.settings = column_of(self.figures, self.penetration, self.counts, fields)
         buttons = hbox(self.start_button, self.find_button)
-        self.group = Group("Capture", form, buttons, self.answer, self.settings)
+        self.group = Group("Capture", FieldForm(self.camera), buttons, self.answer, self.settings)
 
     def take_key(self, key: Qt.Key) -> bool:
         """Run the action of a plain key while live; returns whether it has one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from PySide6.QtCore import QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtCore import QPointF, QRectF, QSignalBlocker, QSize, Qt, Signal
 from PySide6.QtGui import (
     QColor,
     QIcon,
@@ -162,9 +162,8 @@ class StepList(FollowsTheme, QListWidget):
     def show_step(self, key: str) -> None:
         """Select the step in view; none for the welcome page."""
         keys = [step.key for step in self._steps]
-        self.blockSignals(True)
-        self.setCurrentRow(keys.index(key) if key in keys else -1)
-        self.blockSignals(False)
+        with QSignalBlocker(self):
+            self.setCurrentRow(keys.index(key) if key in keys else -1)
 
     def _told(self, row: int) -> None:
         if row >= 0:

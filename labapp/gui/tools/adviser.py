@@ -12,7 +12,7 @@ from labapp.gui.tools import adviser_presenter as presenter
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
-from labapp.gui.widgets.labels import allow, wrapping_label
+from labapp.gui.widgets.labels import allow, heading, wrapping_label
 from labapp.gui.widgets.layouts import Group, fill, scrolled
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.sheet import Sheet
@@ -77,16 +77,15 @@ class AdviserWindow(ToolWindow):
         self.kind = ChoiceField("Kind", kinds, tooltip="Above the work piece, or below it")
         efforts = (("thorough", "thorough: minutes"), ("quick", "quick: a tenth of the time"))
         self.effort = ChoiceField("Search", efforts, tooltip="Quick: the error is known to 20 %")
-        self.form.add_heading("Expected pools: min., max.")
-        self.form.add(self.kind)
+        self.form.add(heading("Expected pools: min., max."), self.kind)
         for key, label, unit, lowest, highest, step, tip in RANGES:
             if key == "bench.projection_angle_deg":
-                self.form.add_heading("Limits of the bench: min., max.")
+                self.form.add(heading("Limits of the bench: min., max."))
             self.ranges[key] = RangeField(
                 label, unit, lowest=lowest, highest=highest, step=step, tooltip=tip
             )
             self.form.add(self.ranges[key])
-        self.form.add_heading("Fixed")
+        self.form.add(heading("Fixed"))
         for key, label, lowest, highest, step, tip in NUMBERS:
             self.numbers[key] = NumberField(
                 label, "mm", lowest=lowest, highest=highest, step=step, tooltip=tip

@@ -11,8 +11,8 @@ from labapp.gui.tasks import Control
 from labapp.gui.tools import analysis_presenter as presenter
 from labapp.gui.tools.analysis_presenter import BUDGET, OPENED, PARTS, USUAL
 from labapp.gui.tools.tool import ToolWindow, progress_of
-from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, flush_fields
-from labapp.gui.widgets.labels import allow, show_words, wrapping_label
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, flush_fields, whole
+from labapp.gui.widgets.labels import allow, heading, show_words, wrapping_label
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 from labapp.studies import SCHEME_NAMES
@@ -55,7 +55,7 @@ class AnalysisWindow(ToolWindow):
         super().__init__(sessions, window)
 
     def _make_form(self) -> None:
-        self.form.add_heading("What is computed")
+        self.form.add(heading("What is computed"))
         self.parts: dict[str, QCheckBox] = {}
         for key, words, tip in PARTS:
             box = QCheckBox(words)
@@ -63,18 +63,16 @@ class AnalysisWindow(ToolWindow):
             box.setChecked(key == BUDGET)
             box.toggled.connect(lambda _: self.show_state())
             self.parts[key] = box
-            self.form.add_wide(box)
-        self.form.add_heading("Of the budget")
+            self.form.add(box)
         self.setup = ChoiceField("Set-up", presenter.SETUPS, tooltip="Whose errors are added up")
         self.setup.edited.connect(lambda _: self.show_state())
-        self.form.add(self.setup)
+        self.form.add(heading("Of the budget"), self.setup)
         self.sizes: dict[str, NumberField] = {}
         for key, label, lowest, highest, step, tip in SIZES:
             self.sizes[key] = NumberField(
                 label, "mm", lowest=lowest, highest=highest, step=step, tooltip=tip
             )
             self.form.add(self.sizes[key])
-        self.form.add_heading("Of the other parts")
         self.scheme = ChoiceField(
             "Schemes", presenter.SCHEME_CHOICES, tooltip="By which schemes; the budget is of fit"
         )
@@ -86,17 +84,10 @@ class AnalysisWindow(ToolWindow):
             step=0.25,
             tooltip="Between the laser's places: half of it takes four times as long",
         )
-        self.frames = NumberField(
-            "Frames of each",
-            lowest=1,
-            highest=1000,
-            decimals=0,
-            tooltip="Of the thumb tack, and of each cap in image processing",
-        )
-        self.draws = NumberField(
-            "Draws", lowest=10, highest=100_000, step=100, decimals=0,
-            tooltip="Of the calibration, in parameter deviation",
-        )  # fmt: skip
+        tip = "Of the thumb tack, and of each cap in image processing"
+        self.frames = whole("Frames of each", 1, tip, 1000)
+        tip = "Of the calibration, in parameter deviation"
+        self.draws = whole("Draws", 10, tip, 100_000, step=100)
         usual = AnalysisOptions()
         for field, value in (
             (self.step, usual.step),
@@ -104,13 +95,13 @@ class AnalysisWindow(ToolWindow):
             (self.draws, usual.draws),
         ):
             field.set_value(value)
-        self.form.add(self.scheme, self.step, self.frames, self.draws)
+        others = heading("Of the other parts")
+        self.form.add(others, self.scheme, self.step, self.frames, self.draws)
 
     def _make_results(self) -> None:
         self.which = ChoiceField("Shown", tooltip="Tables and pictures that are done")
         self.which.edited.connect(lambda _: self._show_chosen())
-        line = FieldForm()
-        line.add(self.which)
+        line = FieldForm(self.which)
         self.words = wrapping_label(
             "Tick what is to be computed, then press Run. All of it is simulated. The budget takes "
             "the ± of the session's set-up, or 0.1 mm, 0.1° and 0.1 px if it has none; the other "

@@ -15,8 +15,8 @@ from labapp.gui.tools import dynamics_presenter as presenter
 from labapp.gui.tools.tool import ToolWindow
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
-from labapp.gui.widgets.labels import wrapping_label
-from labapp.gui.widgets.layouts import hbox, vbox
+from labapp.gui.widgets.labels import heading, wrapping_label
+from labapp.gui.widgets.layouts import column_of, hbox
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 
@@ -50,7 +50,6 @@ class DynamicsWindow(ToolWindow):
         self.workspace.opened.connect(self._forget)
 
     def _make_form(self) -> None:
-        self.form.add_heading("Spectrum")
         self.of = ChoiceField(
             "Measure", presenter.SERIES, tooltip="Whose spectra and peak are shown"
         )
@@ -59,8 +58,7 @@ class DynamicsWindow(ToolWindow):
             "Segment", "s", lowest=0.001, highest=1e4, step=0.05, decimals=3, optional=True,
             tooltip="Duration of a segment of the spectrogram; empty: an eighth of the recording",
         )  # fmt: skip
-        self.form.add(self.of, self.segment)
-        self.form.add_heading("Oscillations looked for")
+        self.form.add(heading("Spectrum"), self.of, self.segment)
         ends = ("From", 0.01, "Lowest"), ("To", 0.01, "Highest")
         self.band = [
             NumberField(
@@ -69,7 +67,7 @@ class DynamicsWindow(ToolWindow):
             )
             for name, lowest, end in ends
         ]  # fmt: skip
-        self.form.add(*self.band)
+        self.form.add(heading("Oscillations looked for"), *self.band)
         for field in (self.segment, *self.band):
             field.set_placeholder("automatic")
 
@@ -105,8 +103,8 @@ class DynamicsWindow(ToolWindow):
             ),
             ("Responses", ((self.response_words, 1), (self.responses, 1))),
         ):
-            page = QWidget()
-            vbox(*parts, of=page).setContentsMargins(6, 6, 6, 6)
+            page = column_of(*parts)
+            page.setContentsMargins(6, 6, 6, 6)
             self.tabs.addTab(page, words)
         for label in (self.peak_words, self.event_words, self.response_words):
             label.setAlignment(Qt.AlignmentFlag.AlignTop)

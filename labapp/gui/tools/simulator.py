@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pyqtgraph as pg
 from PySide6.QtGui import QCloseEvent
 from PySide6.QtWidgets import QWidget
 
@@ -17,9 +16,9 @@ from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import simulator_presenter as presenter
 from labapp.gui.tools.simulator_presenter import ScenarioPreview
 from labapp.gui.tools.tool import ToolWindow, progress_of
-from labapp.gui.views.picture import PictureView
-from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
-from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.views.picture import PictureView, rings
+from labapp.gui.widgets.fields import ChoiceField, flush_fields, whole
+from labapp.gui.widgets.labels import heading, wrapping_label
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.simulated.simulate import begin_session, simulate
@@ -27,9 +26,6 @@ from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.gui.shell.files import Files
-
-RING, RING_PX = "#2fd39b", 15
-"""Rings around the true dots: a colour of the dots page; diameter in points of the screen."""
 
 
 class SimulatorWindow(ToolWindow):
@@ -59,25 +55,17 @@ class SimulatorWindow(ToolWindow):
         )
         self.scenario.edited.connect(lambda _: self.show_scenario())
         self.words = wrapping_label()
-        self.frames = NumberField(
-            "Frames", lowest=1, highest=1_000_000, decimals=0, tooltip="How many are rendered"
-        )
+        self.frames = whole("Frames", 1, "How many are rendered", 1_000_000)
         self.frames.edited.connect(lambda _: self._show_rows())
-        self.seed = NumberField(
-            "Seed",
-            lowest=0,
-            highest=2**31 - 1,
-            decimals=0,
-            tooltip="Seed of the random numbers: the same seed gives the same frames",
-        )
+        tip = "Seed of the random numbers: the same seed gives the same frames"
+        self.seed = whole("Seed", 0, tip, 2**31 - 1)
         self.seed.edited.connect(lambda seed: self._draw(int(seed)))
         self.folder = PathField(
             "Folder",
             tooltip="A new or empty folder, or a former simulation, which is replaced",
         )
         self.table = ResultTable("True values of the first frame")
-        self.form.add(self.scenario)
-        self.form.add_wide(self.words)
+        self.form.add(self.scenario, self.words)
         self.add_to_form(
             "Load scenario…", "Load a scenario of your own (TOML)", self.choose_scenario
         )
@@ -85,14 +73,11 @@ class SimulatorWindow(ToolWindow):
         self.add_to_form(
             "Choose folder…", "The simulation goes into a new one in it", self.choose_folder
         )
-        self.form.add_heading("First frame")
-        self.form.add_wide(self.table)
+        self.form.add(heading("First frame"), self.table)
 
     def _make_results(self) -> None:
         self.picture = PictureView("First frame with its true dots ringed")
-        self._rings = pg.ScatterPlotItem(
-            size=RING_PX, pxMode=True, pen=pg.mkPen(RING, width=1.2), brush=None
-        )
+        self._rings = rings()
         self.picture.add(self._rings)
         self.results.addWidget(self.picture)
 

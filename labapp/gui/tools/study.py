@@ -20,12 +20,12 @@ from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.widgets.fields import (
     ChoiceField,
     FieldForm,
-    NumberField,
     TextField,
     flush_fields,
+    whole,
 )
-from labapp.gui.widgets.labels import show_words, wrapping_label
-from labapp.gui.widgets.layouts import vbox
+from labapp.gui.widgets.labels import heading, show_words, wrapping_label
+from labapp.gui.widgets.layouts import column_of
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable, FittingTable
@@ -79,9 +79,8 @@ class StudyWindow(ToolWindow):
         self._show()
 
     def _make_form(self) -> None:
-        self.form.add_heading("Study")
+        self.form.add(heading("Study"))
         self.add_to_form("Open study…", "Choose a study file (TOML or CSV)", self.choose)
-        self.form.add_heading("New study")
         self.recordings = PathField(
             "Recordings",
             tooltip="A pattern that their paths fit: {current_a} is a condition, * any other part "
@@ -90,9 +89,9 @@ class StudyWindow(ToolWindow):
         self.setup = PathField("Set-up", tooltip="The setup file of them all (TOML)")
         self.recordings.edited.connect(lambda _: self._show_matches())
         self.matches = wrapping_label()
-        self.form.add_wide(self.recordings.label)
-        self.form.add_wide(self.recordings)
-        self.form.add_wide(self.matches)
+        # The pattern is long, so its label is above it.
+        recordings = column_of(self.recordings.label, self.recordings)
+        self.form.add(heading("New study"), recordings, self.matches)
         self.add_to_form("Choose folder…", "Take all recordings in a folder", self.choose_folder)
         self.form.add(self.setup)
         self.add_to_form("Choose set-up…", "Choose a setup file", self.choose_setup)
@@ -101,10 +100,7 @@ class StudyWindow(ToolWindow):
             "Write a study file that lists these recordings, and open it",
             self.choose_new,
         )
-        self.form.add_heading("Run")
-        self.workers = NumberField(
-            "Processes", lowest=1, highest=1024, decimals=0, tooltip="How many recordings at once"
-        )
+        self.workers = whole("Processes", 1, "How many recordings at once", 1024)
         self.workers.set_value(os.cpu_count() or 1)
         self.scheduler = TextField(
             "Dask scheduler",
@@ -115,8 +111,7 @@ class StudyWindow(ToolWindow):
         self.surfaces.setToolTip(
             "Write surfaces.zarr, too: what was measured without is measured again"
         )
-        self.form.add(self.workers, self.scheduler)
-        self.form.add_wide(self.surfaces)
+        self.form.add(heading("Run"), self.workers, self.scheduler, self.surfaces)
 
     def _make_results(self) -> None:
         self.words = wrapping_label(NONE_YET)
@@ -128,10 +123,7 @@ class StudyWindow(ToolWindow):
         self.against = ChoiceField("Against", tooltip="The condition along the plots")
         self.against.edited.connect(lambda _: self._draw())
         self.sheet = Sheet("Plots of the study")
-        line = FieldForm()
-        line.add(self.against)
-        plots = QWidget()
-        vbox(line, (self.sheet, 1), of=plots)
+        plots = column_of(FieldForm(self.against), (self.sheet, 1))
         self.tabs = QTabWidget()
         self.tabs.tabBar().setAccessibleName("Parts of the study")
         for widget, words in (

@@ -19,7 +19,7 @@ from labapp.gui.tasks import PROBLEM, Control, Task, Tasks
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import FieldForm
 from labapp.gui.widgets.labels import Message
-from labapp.gui.widgets.layouts import fill, hbox, scrolled, vbox
+from labapp.gui.widgets.layouts import column_of, fill, hbox, scrolled, vbox
 from labapp.simulation.parallel import Progress, low_priority
 
 if TYPE_CHECKING:
@@ -85,9 +85,9 @@ class ToolWindow(QDialog):
         self.resize(QSize(*SIZE_PX).boundedTo(room))
 
     def _lay_out(self, found: QWidget) -> None:
-        column = QWidget()
-        vbox(self.form, 1, of=column).setContentsMargins(0, 0, 8, 0)
-        side = scrolled(column)
+        fields = column_of(self.form, 1)
+        fields.setContentsMargins(0, 0, 8, 0)
+        side = scrolled(fields)
         side.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         side.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         side.setFixedWidth(FORM_PX + side.verticalScrollBar().sizeHint().width())
@@ -107,7 +107,7 @@ class ToolWindow(QDialog):
 
     def add_to_form(self, words: str, tip: str, do: Callable[[], object]) -> None:
         """Add a button below the existing fields."""
-        self.form.add_wide(button(words, tip, do))
+        self.form.add(button(words, tip, do))
 
     # --- what tools say for themselves ---------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pyqtgraph as pg
-from PySide6.QtCore import Qt, Signal
+from PySide6.QtCore import QSignalBlocker, Qt, Signal
 from PySide6.QtGui import QColor, QKeyEvent
 
 NUDGE_PX = 0.1
@@ -61,9 +61,8 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
         """Move the point without a signal; ignored while it is being dragged."""
         if self.moving:
             return
-        blocked = self.blockSignals(True)
-        self.setPos(u, v)
-        self.blockSignals(blocked)
+        with QSignalBlocker(self):
+            self.setPos(u, v)
 
     def nudge(self, du: float, dv: float) -> None:
         """Move the point by (du, dv) px, as the arrow keys do, unless it is fixed."""

@@ -50,6 +50,9 @@ DARKEST, BRIGHTEST = 1.0, 99.7
 CONTRAST_STEPS = 25
 """Number of steps of the contrast slider that halve or double the range of levels."""
 
+RING, RING_PX = "#2fd39b", 15
+"""Rings around dots: a colour of the dots page; diameter in points of the screen."""
+
 KEYS = (
     "Zoom with the wheel, + and −; F fits; drag with the middle button, or Shift and arrow keys, "
     "to move; [ and ] change the contrast"
@@ -424,6 +427,11 @@ class _Box(pg.ViewBox):  # type: ignore[misc]
         there, before = (self.mapSceneToView(p) for p in (event.scenePos(), event.lastScenePos()))
         self.translateBy(x=before.x() - there.x(), y=before.y() - there.y())
         self.sigRangeChangedManually.emit(self.state["mouseEnabled"])
+
+
+def rings() -> pg.ScatterPlotItem:
+    """Rings around dots, without dots yet."""
+    return pg.ScatterPlotItem(size=RING_PX, pxMode=True, pen=pg.mkPen(RING, width=1.2), brush=None)
 
 
 def auto_levels(grey: GreyImage) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from labapp.gui.dialogs import ask_save
 from labapp.gui.tasks import DONE
 from labapp.gui.theme import palette
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.fields import FieldForm, NumberField
+from labapp.gui.widgets.fields import FieldForm, whole
 from labapp.gui.widgets.labels import plain_tip, wrapping_label
 from labapp.gui.widgets.layouts import hbox, vbox
 
@@ -39,20 +39,15 @@ class PaperDialog(QDialog):
         super().__init__(parent)
         self.setObjectName("save-picture")
         self.setWindowTitle("Save picture")
-        self.width_mm = NumberField(
-            *("Width on paper", "mm"), lowest=20, highest=300, step=5, decimals=0,
-            tooltip="90 mm is one column of a journal, 180 mm two; margins are cropped",
-        )  # fmt: skip
-        self.dpi = NumberField(
-            *("Resolution", "dpi"), lowest=72, highest=600, step=50, decimals=0,
-            tooltip="Pixels per inch; journals ask for 300 or 600. An SVG of a plot has none",
-        )  # fmt: skip
+        tip = "90 mm is one column of a journal, 180 mm two; margins are cropped"
+        self.width_mm = whole("Width on paper", 20, tip, 300, unit="mm", step=5)
+        tip = "Pixels per inch; journals ask for 300 or 600. An SVG of a plot has none"
+        self.dpi = whole("Resolution", 72, tip, 600, unit="dpi", step=50)
         self.size_words = wrapping_label()
-        form = FieldForm()
+        form = FieldForm(self.width_mm, self.dpi)
         for field, value in ((self.width_mm, self.paper.width_mm), (self.dpi, self.paper.dpi)):
             field.set_value(value)
             field.edited.connect(lambda _: self._take())
-            form.add(field)
         save = button("Save as…", "Choose the file; its extension sets the format", self.accept)
         save.setDefault(True)
         cancel = button("Cancel", "Save nothing (Esc)", self.reject)

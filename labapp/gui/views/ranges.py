@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from PySide6.QtWidgets import QWidget
-
 from labapp.gui.widgets.fields import Field, NumberField
-from labapp.gui.widgets.layouts import hbox
+from labapp.gui.widgets.layouts import row_of
 
 
 class RangeField(Field):
@@ -32,8 +30,7 @@ class RangeField(Field):
             )
             for end in ("least", "most")
         )
-        pair = QWidget()
-        hbox((self.least, 1), (self.most, 1), of=pair)
+        pair = row_of((self.least, 1), (self.most, 1))
         for field in (self.least, self.most):
             field.unit.hide()  # shown once, after both
             field.edited.connect(self._emit_change)

@@ -23,7 +23,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.digits import entered, parsed
-from labapp.gui.widgets.labels import heading, plain_label, plain_tip, show_words, wrapping_label
+from labapp.gui.widgets.labels import plain_label, plain_tip, show_words, wrapping_label
 from labapp.gui.widgets.layouts import hbox, vbox
 
 MOUSE_MS = 20
@@ -408,29 +408,36 @@ class ChoiceField(Field):
 
 
 class FieldForm(QWidget):
-    """Fields one below the other: labels at the left, editors and units in columns.
+    """Parts one below the other; of fields, labels, editors and units are in columns.
 
     A field may have another beside it, in a narrow column at the right.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *parts: QWidget) -> None:
         super().__init__()
         self._grid = QGridLayout(self)
         self._grid.setContentsMargins(0, 0, 0, 0)
         self._grid.setColumnStretch(0, 2)
         self._grid.setColumnStretch(1, 3)
         self._fields: list[Field] = []
+        self.add(*parts)
 
-    def add(self, *fields: Field, beside: Field | None = None) -> None:
-        """Put fields below the others, and perhaps one without label and unit beside the last."""
-        for field in fields:
+    def add(self, *parts: QWidget, beside: Field | None = None) -> None:
+        """Put parts below the others, and perhaps a field without label and unit beside the last.
+
+        What is not a field takes the whole width.
+        """
+        for part in parts:
             row = self._grid.rowCount()
-            self._grid.addWidget(field.label, row, 0, Qt.AlignmentFlag.AlignTop)
-            self._grid.addWidget(field, row, 1)
+            if not isinstance(part, Field):
+                self._grid.addWidget(part, row, 0, 1, 3)
+                continue
+            self._grid.addWidget(part.label, row, 0, Qt.AlignmentFlag.AlignTop)
+            self._grid.addWidget(part, row, 1)
             # Aligned with the editor's first line.
-            height = field.editor.fontMetrics().lineSpacing() + 12
-            field.label.setMinimumHeight(min(field.editor.sizeHint().height(), height))
-            self._fields.append(field)
+            height = part.editor.fontMetrics().lineSpacing() + 12
+            part.label.setMinimumHeight(min(part.editor.sizeHint().height(), height))
+            self._fields.append(part)
         if beside is not None:
             beside.unit.hide()
             digits = beside.editor.fontMetrics().horizontalAdvance("0.0000")
@@ -442,14 +449,6 @@ class FieldForm(QWidget):
         for unit in units:
             unit.setMinimumWidth(width)
 
-    def add_heading(self, words: str) -> None:
-        """Begin a group of fields."""
-        self._grid.addWidget(heading(words), self._grid.rowCount(), 0, 1, 3)
-
-    def add_wide(self, widget: QWidget) -> None:
-        """Put something else below the fields, over the whole width."""
-        self._grid.addWidget(widget, self._grid.rowCount(), 0, 1, 3)
-
 
 def flush_fields(part: QWidget) -> None:
     """Finish edits in progress in all fields within a part, as leaving them does."""
@@ -457,6 +456,10 @@ def flush_fields(part: QWidget) -> None:
         field.flush()
 
 
-def whole(label: str, lowest: int, tip: str) -> NumberField:
+def whole(
+    label: str, lowest: int, tip: str, highest: int = 10**9, *, unit: str = "", step: int = 1
+) -> NumberField:
     """A field for a whole number."""
-    return NumberField(label, lowest=lowest, highest=10**9, decimals=0, tooltip=tip)
+    return NumberField(
+        label, unit, lowest=lowest, highest=highest, step=step, decimals=0, tooltip=tip
+    )

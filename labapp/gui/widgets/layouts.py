@@ -48,6 +48,20 @@ def hbox(*parts: Part, of: QWidget | None = None) -> QHBoxLayout:
     return _bare(QHBoxLayout() if of is None else QHBoxLayout(of), parts)
 
 
+def column_of(*parts: Part) -> QWidget:
+    """A widget of parts one below the other, without margins."""
+    made = QWidget()
+    vbox(*parts, of=made)
+    return made
+
+
+def row_of(*parts: Part) -> QWidget:
+    """A widget of parts side by side, without margins."""
+    made = QWidget()
+    hbox(*parts, of=made)
+    return made
+
+
 class _ScrollArea(QScrollArea):
     """Scrolls to the widget that Tab leads to, and stays where it is if a widget is disabled.
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import Qt, QTimer, Signal
+from PySide6.QtCore import QSignalBlocker, Qt, QTimer, Signal
 from PySide6.QtGui import QIcon, QPainter, QPalette, QResizeEvent
 from PySide6.QtWidgets import (
     QSizePolicy,
@@ -154,9 +154,8 @@ class Timeline(FollowsTheme, QWidget):
         self._frames, self._times_s = frames, times_s
         self.scrubber.set_kinds(kinds)
         self.setEnabled(len(frames) > 0)
-        self.number.blockSignals(True)
-        self.number.setRange(*((int(frames[0]), int(frames[-1])) if len(frames) else (0, 0)))
-        self.number.blockSignals(False)
+        with QSignalBlocker(self.number):
+            self.number.setRange(*((int(frames[0]), int(frames[-1])) if len(frames) else (0, 0)))
         self._show_counts()
 
     def set_frame(self, frame: int) -> None:
@@ -166,9 +165,8 @@ class Timeline(FollowsTheme, QWidget):
             return
         position = int(np.searchsorted(self._frames, frame).clip(0, len(self._frames) - 1))
         self.scrubber.set_position(position)
-        self.number.blockSignals(True)
-        self.number.setValue(frame)
-        self.number.blockSignals(False)
+        with QSignalBlocker(self.number):
+            self.number.setValue(frame)
         time_s = self._times_s[position]
         when = "" if np.isnan(time_s) else f" · {time_s:.4f} s"
         self.position_text.setText(f"{position + 1} of {len(self._frames)}{when}")

@@ -19,7 +19,7 @@ from labapp.media.cameras.base import (
     Trigger,
 )
 from labapp.media.cameras.feed import Counts, Feed
-from labapp.media.cameras.simulated import Faults, SimulatedDevice, there_and_back
+from labapp.media.cameras.simulated import SimulatedDevice, there_and_back
 
 __all__ = [
     "KINDS",
@@ -32,7 +32,6 @@ __all__ = [
     "CameraLost",
     "CameraSettings",
     "Counts",
-    "Faults",
     "Feed",
     "Limits",
     "Range",

@@ -1,4 +1,4 @@
-"""Simulated camera: any pictures at any frame rate, with the faults of real cameras.
+"""Simulated camera: any pictures at any frame rate.
 
 `SimulatedDevice` is the hardware, which exists while cameras are opened and closed.
 """
@@ -8,20 +8,15 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
-
-import numpy as np
 
 from labapp.media.base import GreyImage
 from labapp.media.cameras.base import (
-    BrokenFrame,
     Camera,
     CameraError,
     CameraFrame,
     CameraInfo,
-    CameraLost,
     CameraSettings,
     Limits,
     Range,
@@ -39,23 +34,6 @@ def there_and_back(images: Sequence[GreyImage]) -> Callable[[int], GreyImage]:
     last = len(images) - 1
     order = [*range(last), *range(last, 0, -1)] or [0]
     return lambda number: images[order[number % len(order)]]
-
-
-@dataclass(frozen=True)
-class Faults:
-    """Simulated faults, random with a seed."""
-
-    garbage: float = 0.0
-    """Fraction of frames that are truncated, of another size or of another type, 0 … 1."""
-    dropped: float = 0.0
-    """Fraction of frames that never arrive, 0 … 1."""
-    unplug_every: int = 0
-    unplugged_s: float = 0.2
-    """Number of frames between disconnections, and their duration, s; 0: never."""
-    stall_every: int = 0
-    stalled_s: float = 0.5
-    """Number of frames between stalls, and their duration, s; 0: never."""
-    seed: int = 0
 
 
 class SimulatedDevice:
@@ -81,76 +59,25 @@ class SimulatedDevice:
         *,
         bit_depth: int = 8,
         rate_hz: float = 60.0,
-        faults: Faults | None = None,
     ) -> None:
         self.info = CameraInfo(f"simulated:{name}", f"simulated {Path(name).name}", "simulated")
         self.picture = picture
         self.bit_depth = bit_depth
-        self.faults = faults or Faults()
         rows, columns = picture(0).shape
         self.sensor = (columns, rows)
         self.settings = CameraSettings(rate_hz=rate_hz, region=(0, 0, columns, rows))
         self.taken = 0
-        """Number of frames exposed, which with the seed determines the random numbers."""
-        self.disconnects = 0
-        self._unplugged_until_s = 0.0
-        self._stalled_until_s = 0.0
+        """Number of frames exposed."""
 
     def open(self) -> SimulatedCamera:
-        """Open it as a camera.
-
-        Raises
-        ------
-        CameraLost
-            If it is unplugged.
-        """
-        if not self.plugged:
-            raise CameraLost(f"{self.info.name} is not connected")
+        """Open it as a camera."""
         return SimulatedCamera(self)
 
-    @property
-    def plugged(self) -> bool:
-        """Whether it is connected."""
-        return time.monotonic() >= self._unplugged_until_s
-
-    @property
-    def stalled_s(self) -> float:
-        """Remaining duration of a stall, s."""
-        return max(0.0, self._stalled_until_s - time.monotonic())
-
-    def unplug(self, seconds: float = float("inf")) -> None:
-        """Disconnect it for a time."""
-        self.disconnects += 1
-        self._unplugged_until_s = time.monotonic() + seconds
-
-    def plug(self) -> None:
-        """Connect it again."""
-        self._unplugged_until_s = 0.0
-
-    def stall(self, seconds: float) -> None:
-        """Deliver no frames for a time."""
-        self._stalled_until_s = time.monotonic() + seconds
-
-    def expose(self) -> tuple[GreyImage, Literal["", "lost", "cut off"]]:
-        """Expose the next frame; returns it with its fate in transfer."""
-        number, faults = self.taken, self.faults
-        self.taken += 1
+    def expose(self) -> GreyImage:
+        """Expose the next frame."""
         u, v, width, height = self.settings.region or (0, 0, *self.sensor)
-        image = self.picture(number)[v : v + height, u : u + width]
-        if faults.unplug_every and self.taken % faults.unplug_every == 0:
-            self.unplug(faults.unplugged_s)
-        if faults.stall_every and self.taken % faults.stall_every == 0:
-            self.stall(faults.stalled_s)
-        if not (faults.garbage or faults.dropped):
-            return image, ""
-        lot, form = np.random.default_rng([faults.seed, number]).uniform(size=2)
-        if lot < faults.dropped:
-            return image, "lost"
-        if lot < faults.dropped + faults.garbage:
-            if form < 1 / 3:
-                return image, "cut off"
-            return (image[: height // 2] if form < 2 / 3 else image.astype(np.float32)), ""
-        return image, ""
+        self.taken += 1
+        return self.picture(self.taken - 1)[v : v + height, u : u + width]
 
 
 class SimulatedCamera(Camera):
@@ -166,7 +93,6 @@ class SimulatedCamera(Camera):
             triggers=("free", "software"),
         )
         self._device = device
-        self._disconnects = device.disconnects
         self._begun_s: float | None = None
         self._next = 0
         self._pulled = threading.Semaphore(0)
@@ -197,21 +123,12 @@ class SimulatedCamera(Camera):
 
     def read(self, timeout_s: float) -> CameraFrame | None:
         """Wait for the next frame; see `Camera.read`."""
-        until_s = time.monotonic() + timeout_s
-        while True:
-            number = self._await(until_s)
-            # Also if it was disconnected and connected again.
-            if not self._device.plugged or self._device.disconnects > self._disconnects:
-                self._begun_s = None
-                raise CameraLost(f"{self.info.name} was unplugged")
-            if number is None:
-                return None
-            image, fate = self._device.expose()
-            if fate == "cut off":
-                raise BrokenFrame("it was truncated in transfer")
-            if fate != "lost":
-                now_s = time.monotonic()
-                return CameraFrame(number, self._clock_s(number, now_s), now_s, image)
+        number = self._await(time.monotonic() + timeout_s)
+        return None if number is None else self._arrived(number, self._device.expose())
+
+    def _arrived(self, number: int, image: GreyImage) -> CameraFrame:
+        now_s = time.monotonic()
+        return CameraFrame(number, self._clock_s(number, now_s), now_s, image)
 
     def trigger(self) -> None:
         """Trigger a frame."""
@@ -249,11 +166,6 @@ class SimulatedCamera(Camera):
         assert self._begun_s is not None
         period_s = 1 / (self._device.settings.rate_hz or 1.0)
         now_s = time.monotonic()
-        if (stalled_s := self._device.stalled_s) > 0:
-            time.sleep(max(0.0, min(stalled_s, until_s - now_s)))
-            # Frames are not counted during a stall.
-            self._begun_s += time.monotonic() - now_s
-            return None
         due_s = self._begun_s + self._next * period_s
         late = int((now_s - due_s) / period_s)
         if late > self._buffered:

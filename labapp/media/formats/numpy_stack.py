@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import mmap
-import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +25,7 @@ from labapp.media.formats.stored import (
     rate_of,
 )
 
-NPY_MAGIC = b"\x93NUMPY"
+NPY_MAGIC = np.lib.format.MAGIC_PREFIX
 ZIP_MAGIC = b"PK\x03\x04"
 
 A_STACK = "an array of shape (frames, rows, columns) or (frames, rows, columns, 3 or 4)"
@@ -34,16 +33,7 @@ A_NPZ = f"a .npz with {A_STACK} named frames"
 
 BIT_DEPTHS = {"bool": 8, "uint8": 8, "uint16": 16}
 
-MAX_HEADER = 2**16
-"""Largest header, bytes; usual are about a hundred."""
-
-NAMED = {"descr": "type"}
-EXPECTED = {
-    "descr": "an array of numbers (uint8, uint16, float32 …), no Python objects",
-    "fortran_order": "True or False",
-    "shape": A_STACK,
-}
-"""Name of a header entry in messages, and its expected value."""
+NUMBERS = "an array of numbers (uint8, uint16, float32 …), no Python objects"
 
 MOST_HELD = 2**30
 """Largest compressed array, which is decompressed in memory, bytes."""
@@ -112,29 +102,17 @@ class NumpyStack(StoredFrames):
 
 
 def _header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read shape, Fortran order and type of the array at the position of ``file``.
-
-    The header is the text of a Python dict. It is searched rather than evaluated, as evaluation of
-    a damaged one can raise many errors.
-    """
-    head = file.read(12)
-    if len(head) < 12 or head[:6] != NPY_MAGIC or head[6] not in (1, 2, 3):
-        raise InputError(path, "header", "not that of an array", "a NumPy array, version 1 to 3")
-    counted = 2 if head[6] == 1 else 4
-    length = int.from_bytes(head[8 : 8 + counted], "little") - (4 - counted)
-    text = (head[8 + counted :] + file.read(min(max(length, 0), MAX_HEADER))).decode("latin-1")
-
-    def entry(key: str, form: str) -> str:
-        found = re.search(rf"""['"]{key}['"]\s*:\s*{form}""", text)
-        if found is None:
-            other = re.search(rf"""['"]{key}['"]\s*:\s*(\S[^,]*)""", text)
-            value = other[1] if other else "missing"
-            raise InputError(path, NAMED.get(key, key), value, EXPECTED[key])
-        return found[1]
-
-    kind = np.dtype(entry("descr", r"""['"]([<>|=]?(?:[bui]1|[ui][248]|f(?:2|4|8)))['"]"""))
-    columns_first = entry("fortran_order", "(True|False)") == "True"
-    shape = tuple(int(side) for side in re.findall(r"\d+", entry("shape", r"\(([\d\s,]{,200})\)")))
+    """Read shape, Fortran order and type of the array at the position of ``file``."""
+    try:
+        is_first = np.lib.format.read_magic(file) == (1, 0)
+        read = np.lib.format.read_array_header_1_0
+        read = read if is_first else np.lib.format.read_array_header_2_0
+        shape, columns_first, kind = read(file)
+    except Exception as error:
+        # The header is the text of a Python dict: damage raises nearly every kind of error.
+        raise InputError(path, "header", error, "that of a NumPy array") from error
+    if kind.kind not in "buif" or kind.itemsize > 8:
+        raise InputError(path, "type", f"'{kind.str}'", NUMBERS)
     return shape, columns_first, kind
 
 

@@ -76,18 +76,14 @@ def line_trend(session: SessionContents) -> LineTrend:
             numbers.append(number)
             stale.append(old)
             found.append(result.measurement.lines)
-    place = np.searchsorted(seen.frame, np.array(numbers, np.int64))
+    frame, is_stale = np.array(numbers, np.int64), np.array(stale, bool)
     if any(one.track is not None for one in found):
-        return LineTrend(
-            frame=np.array(numbers, np.int64),
-            stale=np.array(stale, bool),
-            values={
-                name: np.array([getattr(one.track, name, np.nan) for one in found], float)
-                for name, *_ in TRACK_QUANTITIES
-            },
-            height_sigma_mm=np.full(len(found), np.nan),
-            states=(),
-        )
+        values = {
+            name: np.array([getattr(one.track, name, np.nan) for one in found], float)
+            for name, *_ in TRACK_QUANTITIES
+        }
+        return LineTrend(frame, is_stale, values, np.full(len(found), np.nan), states=())
+    place = np.searchsorted(seen.frame, frame)
     enough = len(found) >= FEWEST and bool((np.diff(place) == 1).all())
     sure = [one.surface if one.status == "ok" else None for one in found]
     values = {
@@ -97,10 +93,6 @@ def line_trend(session: SessionContents) -> LineTrend:
     }
     height = [np.nan if one is None else one.height_mm for one in sure]
     sigma = [np.nan if one is None else one.height_sigma_mm for one in sure]
-    return LineTrend(
-        frame=np.array(numbers, np.int64),
-        stale=np.array(stale, bool),
-        values=values | {"pool_height_mm": np.array(height, float)},
-        height_sigma_mm=np.array(sigma, float),
-        states=line_states(LineSeries.of(found)) if enough else (),
-    )
+    values["pool_height_mm"] = np.array(height, float)
+    states = line_states(LineSeries.of(found)) if enough else ()
+    return LineTrend(frame, is_stale, values, np.array(sigma, float), states)

@@ -107,20 +107,19 @@ def densest(fits: Sequence[PatternFit]) -> PatternFit | None:
 def pattern_table(fits: Sequence[PatternFit]) -> Table:
     """The comparison, the coarsest pattern first."""
     best = densest(fits)
-    return Table(
+    return Table.of(
         "patterns",
         "Dot patterns with the same fan at the recommended position: dots of the pools with the "
         "fewest and the most, and minimum distance to the next dot for 95 % of the dots"
         + (f". Densest resolvable pattern: {best.name}" if best else ". None is resolvable"),
-        ("pattern", "least_dots", "most_dots", "spacing_px", "resolvable"),
-        tuple(
-            (
-                one.name,
-                one.least_dots,
-                one.most_dots,
-                one.spacing_px,
-                "yes" if one.resolvable else "no",
-            )
+        [
+            {
+                "pattern": one.name,
+                "least_dots": one.least_dots,
+                "most_dots": one.most_dots,
+                "spacing_px": one.spacing_px,
+                "resolvable": "yes" if one.resolvable else "no",
+            }
             for one in fits
-        ),
+        ],
     )

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from labapp.simulation.forward import trace
+from labapp.simulation.positioning import side_view
 from labapp.studies.adviser.bench_limits import CONSTRAINTS
 from labapp.studies.adviser.search import MOVED, Advice, Candidate, constraint_text
 from labapp.studies.plotting import INCHES, new_figure
+from labapp.studies.side_picture import draw_side
 from labapp.studies.tables import Cell, Table
 
 WORDS = {
@@ -123,7 +124,7 @@ def _row(what: str, one: Candidate, error_mm: float) -> tuple[Cell, ...]:
 
 def cost_table(advice: Advice) -> Table:
     """Mean cost of each mm and degree away, up to the first violated constraints."""
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[dict[str, Cell]] = []
     for sweep in advice.sweeps:
         own = int(np.argmin(np.abs(sweep.value - getattr(advice.best.place, sweep.name))))
         # The reflected rays change from pool to pool: the slope over a short way is chance.
@@ -140,32 +141,24 @@ def cost_table(advice: Advice) -> Table:
                 if np.isfinite(sweep.error_mm[[own, end]]).all():
                     more = float(1000 * (sweep.error_mm[end] - sweep.error_mm[own]) / apart)
             wrong = broken[0] if broken else None
+            breaks = () if wrong is None else sweep.breaks(wrong)
+            words, unit = WORDS[sweep.name]
             rows.append(
-                (
-                    *WORDS[sweep.name],
-                    "less" if way < 0 else "more",
-                    more,
-                    float(sweep.value[kept[-1] if kept else own]),
-                    None if wrong is None else float(sweep.value[wrong]),
-                    "; ".join(CONSTRAINTS[name][0] for name in sweep.breaks(wrong))
-                    if wrong is not None
-                    else "",
-                )
+                {
+                    "quantity": words,
+                    "unit": unit,
+                    "way": "less" if way < 0 else "more",
+                    "more_error_um_per_unit": more,
+                    "kept_to": float(sweep.value[kept[-1] if kept else own]),
+                    "broken_at": None if wrong is None else float(sweep.value[wrong]),
+                    "what_breaks": "; ".join(CONSTRAINTS[name][0] for name in breaks),
+                }
             )
-    return Table(
+    return Table.of(
         "cost",
         "Cost of each mm and degree away from the recommended set-up, µm of error; last value that "
         "meets all conditions and first that does not, of those checked",
-        (
-            "quantity",
-            "unit",
-            "way",
-            "more_error_um_per_unit",
-            "kept_to",
-            "broken_at",
-            "what_breaks",
-        ),
-        tuple(rows),
+        rows,
     )
 
 
@@ -187,28 +180,15 @@ def advice_picture(advice: Advice) -> Figure:
 
 def _draw_bench(plot: Any, advice: Advice) -> None:
     place = advice.best.place
-    rig = advice.limits.rig(place)
-    pool = advice.expected.at(np.full(5, 0.5))
-    seen = trace(pool, rig)
-    laser, column = rig.laser.position_mm, (rig.pattern.columns - 1) // 2
-    for row in np.flatnonzero(seen.hit[:, column] & ~seen.absent[:, column]):
-        point = seen.point_mm[row, column]
-        end = point + 60 * seen.reflected[row, column]
-        if np.isfinite(seen.plane_mm[row, column]).all():
-            end = rig.imaging_plane.to_universal(seen.plane_mm[row, column])
-        colour = KEPT if seen.visible[row, column] else BROKEN
-        plot.plot(*np.stack([laser, point, end])[:, 1:].T, color=colour, lw=0.6)
-    y = np.linspace(-1, 1, 81) * sum(advice.expected.length_mm) / 4 * (1 - 1e-9)
-    plot.plot(y, pool.height(np.zeros_like(y), y), color="#c05a00", lw=1.8)
-    plot.axhline(0, color="0.3", lw=0.6)
-    top = place.h_mm + rig.imaging_plane.height_mm
-    plot.plot([-place.plane_mm] * 2, [place.h_mm, top], "k", lw=1.8)
-    tip = rig.electrode.height_mm
-    plot.fill([0, 1.2, 1.2, -1.2, -1.2], [tip, tip + 4, 40, 40, tip + 4], "0.7", ec="0.3", lw=0.5)
-    plot.plot(*laser[1:], "ks", ms=4)
-    plot.annotate("laser", laser[1:], (5, 3), textcoords="offset points")
-    plot.annotate("imaging plane", (-place.plane_mm, top), (5, -8), textcoords="offset points")
-    plot.set(aspect="equal", xlabel="Y (mm)", ylabel="Z (mm)", ylim=(-5, top + 5))
+    pools = advice.expected
+    width, length = (sum(ends) / 2 for ends in (pools.width_mm, pools.length_mm))
+    height = pools.sign * pools.mean_height_mm
+    view = side_view(advice.limits.rig(place), width, length, height)
+    draw_side(plot, view)
+    top = view.plane_mm[1]
+    plot.annotate("laser", view.laser_mm, (5, 3), textcoords="offset points")
+    plot.annotate("imaging plane", top, (5, -8), textcoords="offset points")
+    plot.set(xlabel="Y (mm)", ylim=(-5, top[1] + 5))
     message = "recommended" if advice.possible else "nearest; not possible"
     plot.set_title(
         f"{message}: laser {place.projection_angle_deg:.1f}°, {place.distance_mm:.1f} mm; "

@@ -32,7 +32,6 @@ from labapp.media.cameras import (
     CameraInfo,
     CameraKind,
     CameraSettings,
-    Faults,
     SimulatedDevice,
 )
 from labapp.media.recording.recorder import Plan
@@ -42,6 +41,7 @@ from labapp.simulated.simulated_pool import camera_pool, pool_camera, simulated_
 from tests.gui.conftest import SAMPLES, let_draw
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
+from tests.media.cameras.faulty import Faults, FaultyDevice
 from tests.waiting import PATIENCE_S, wait_until
 
 SHAPE = (48, 64)
@@ -129,7 +129,7 @@ def test_newest_frame_is_returned_once_and_assessed(live: Live):
 
 
 def test_camera_faults_are_reported_and_no_recorded_frame_is_lost(live: Live):
-    device = SimulatedDevice("test", numbered, faults=Faults(garbage=0.1, dropped=0.05, seed=3))
+    device = FaultyDevice("test", numbered, faults=Faults(garbage=0.1, dropped=0.05, seed=3))
     live.open(device.open)
     wait_until(lambda: live.feed.counts.frames > 20)
     live.trigger()
@@ -207,7 +207,7 @@ def test_plan_set_while_recording_applies_to_the_next_one(live: Live):
 
 
 def test_ring_buffer_is_empty_after_a_trigger(live: Live):
-    device = SimulatedDevice("test", numbered)
+    device = FaultyDevice("test", numbered)
     live.set_plan(Plan(before_s=0.5, after_s=0.1))
     live.open(device.open)
     wait_until(lambda: live.before_trigger()[0] > 0.9)
@@ -286,15 +286,15 @@ def test_simulated_camera_shows_a_pool_on_the_bench_of_the_session(tmp_path: Pat
 
 
 @pytest.fixture
-def device() -> SimulatedDevice:
-    return SimulatedDevice("test", numbered, rate_hz=100)
+def device() -> FaultyDevice:
+    return FaultyDevice("test", numbered, rate_hz=100)
 
 
 @pytest.fixture
 def page(
     window: MainWindow,
     tmp_path: Path,
-    device: SimulatedDevice,
+    device: FaultyDevice,
     qtbot: QtBot,
     monkeypatch: pytest.MonkeyPatch,
 ) -> CapturePage:

@@ -16,12 +16,13 @@ from labapp.gui.live import live
 from labapp.gui.live import view as live_view
 from labapp.gui.shell.window import MainWindow
 from labapp.media import GreyImage
-from labapp.media.cameras import Faults, feed
+from labapp.media.cameras import feed
 from labapp.media.recording import recorder
 from labapp.media.recording.nut import NutWriter
 from labapp.media.recording.recorder import Recorder
 from labapp.session.session import Session
 from tests.benchmarks.filming import Disk, FilmedDevice, compare, how_many, times_told
+from tests.media.cameras.faulty import Faults
 
 pytestmark = pytest.mark.soak
 

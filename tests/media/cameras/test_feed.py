@@ -14,11 +14,10 @@ from labapp.media.cameras import (
     CameraFrame,
     CameraLost,
     CameraSettings,
-    Faults,
     Feed,
-    SimulatedDevice,
     feed,
 )
+from tests.media.cameras.faulty import Faults, FaultyDevice
 from tests.media.cameras.watching import Events, number_in, numbered
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -36,7 +35,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_frame_is_passed_on_with_its_number_and_time() -> None:
-    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    device = FaultyDevice("test", numbered, rate_hz=1000)
     frames: list[CameraFrame] = []
     with Feed("test", device.open, frames.append) as running:
         wait_until(lambda: len(frames) >= 100)
@@ -50,7 +49,7 @@ def test_every_frame_is_passed_on_with_its_number_and_time() -> None:
 
 
 def test_failure_to_open_or_set_at_the_start_is_an_error() -> None:
-    device = SimulatedDevice("test", numbered)
+    device = FaultyDevice("test", numbered)
     with pytest.raises(InputError, match="rate_hz"):
         Feed("test", device.open, print, settings=CameraSettings(rate_hz=-1))
     device.unplug()
@@ -61,7 +60,7 @@ def test_failure_to_open_or_set_at_the_start_is_an_error() -> None:
 @pytest.mark.usefixtures("hasty")
 def test_feed_survives_and_reports_fifty_disconnections() -> None:
     faults = Faults(garbage=0.05, dropped=0.02, unplug_every=40, unplugged_s=0.01, seed=3)
-    device = SimulatedDevice("test", numbered, rate_hz=2000, faults=faults)
+    device = FaultyDevice("test", numbered, rate_hz=2000, faults=faults)
     frames: list[CameraFrame] = []
     events = Events()
     settings = CameraSettings(region=(0, 0, 32, 16))
@@ -93,7 +92,7 @@ def test_stalled_camera_is_reported_and_continues(
     hasty: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(feed, "HOPELESS_S", 3600)
-    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    device = FaultyDevice("test", numbered, rate_hz=1000)
     frames: list[CameraFrame] = []
     events = Events()
     with Feed("test", device.open, frames.append, events.append) as running:
@@ -110,7 +109,7 @@ def test_stalled_camera_is_reported_and_continues(
 
 @pytest.mark.usefixtures("hasty")
 def test_camera_stalled_for_long_is_reopened() -> None:
-    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    device = FaultyDevice("test", numbered, rate_hz=1000)
     frames: list[CameraFrame] = []
     events = Events()
     with Feed("test", device.open, frames.append, events.append) as running:
@@ -125,7 +124,7 @@ def test_camera_stalled_for_long_is_reopened() -> None:
 
 @pytest.mark.usefixtures("hasty")
 def test_camera_waiting_for_a_trigger_is_not_stalled() -> None:
-    device = SimulatedDevice("test", numbered)
+    device = FaultyDevice("test", numbered)
     frames: list[CameraFrame] = []
     events = Events()
     settings = CameraSettings(trigger="software")
@@ -149,7 +148,7 @@ def test_camera_waiting_for_a_trigger_is_not_stalled() -> None:
 
 @pytest.mark.usefixtures("hasty")
 def test_triggers_of_a_lost_camera_are_not_executed_later() -> None:
-    device = SimulatedDevice("test", numbered)
+    device = FaultyDevice("test", numbered)
     frames: list[CameraFrame] = []
     settings = CameraSettings(trigger="software")
     with Feed("test", device.open, frames.append, settings=settings) as running:
@@ -168,7 +167,7 @@ def test_triggers_of_a_lost_camera_are_not_executed_later() -> None:
 
 @pytest.mark.usefixtures("hasty")
 def test_trigger_mode_of_an_earlier_use_is_reset() -> None:
-    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    device = FaultyDevice("test", numbered, rate_hz=1000)
     device.settings = replace(device.settings, trigger="software")
     frames: list[CameraFrame] = []
     with Feed("test", device.open, frames.append, settings=CameraSettings(rate_hz=500)) as running:
@@ -178,7 +177,7 @@ def test_trigger_mode_of_an_earlier_use_is_reset() -> None:
 
 
 def test_settings_are_applied_while_running_and_after_reconnection(hasty: None) -> None:
-    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    device = FaultyDevice("test", numbered, rate_hz=1000)
     frames: list[CameraFrame] = []
     with Feed("test", device.open, frames.append) as running:
         wait_until(lambda: len(frames) > 10)
@@ -201,7 +200,7 @@ def test_settings_are_applied_while_running_and_after_reconnection(hasty: None) 
 
 
 def test_frames_missing_while_settings_change_are_reported() -> None:
-    device = SimulatedDevice("test", numbered, rate_hz=100)
+    device = FaultyDevice("test", numbered, rate_hz=100)
     frames: list[CameraFrame] = []
     events = Events()
 
@@ -243,7 +242,7 @@ def test_frames_missing_while_settings_change_are_reported() -> None:
 
 @pytest.mark.usefixtures("hasty")
 def test_reason_of_a_failed_reconnection_is_reported_once() -> None:
-    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    device = FaultyDevice("test", numbered, rate_hz=1000)
     is_in_use = False
     events = Events()
     attempts = 0
@@ -266,7 +265,7 @@ def test_reason_of_a_failed_reconnection_is_reported_once() -> None:
 
 @pytest.mark.usefixtures("hasty")
 def test_feed_can_be_stopped_while_its_camera_is_lost() -> None:
-    device = SimulatedDevice("test", numbered)
+    device = FaultyDevice("test", numbered)
     running = Feed("test", device.open, lambda _: None)
     device.unplug()
     wait_until(lambda: running.state == "lost")
@@ -276,14 +275,14 @@ def test_feed_can_be_stopped_while_its_camera_is_lost() -> None:
 
 
 def test_stopped_feed_rejects_settings() -> None:
-    running = Feed("test", SimulatedDevice("test", numbered).open, lambda _: None)
+    running = Feed("test", FaultyDevice("test", numbered).open, lambda _: None)
     running.stop()
     with pytest.raises(CameraError, match="test is closed"):
         running.apply(CameraSettings(rate_hz=10)).result(PATIENCE_S)
 
 
 def test_exception_of_a_frame_sink_is_reported_and_closes_the_camera() -> None:
-    device = SimulatedDevice("test", numbered)
+    device = FaultyDevice("test", numbered)
     events = Events()
     closed = threading.Event()
 

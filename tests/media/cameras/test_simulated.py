@@ -12,10 +12,10 @@ from labapp.media.cameras import (
     CameraFrame,
     CameraLost,
     CameraSettings,
-    Faults,
     SimulatedDevice,
     base,
 )
+from tests.media.cameras.faulty import Faults, FaultyDevice
 from tests.media.cameras.watching import number_in, numbered
 
 
@@ -108,7 +108,7 @@ def test_too_slow_reader_loses_frames(
 
 
 def test_unplugged_camera_can_be_opened_after_plugging_in() -> None:
-    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    device = FaultyDevice("test", numbered, rate_hz=1000)
     camera = device.open()
     camera.start()
     device.unplug()
@@ -123,7 +123,7 @@ def test_unplugged_camera_can_be_opened_after_plugging_in() -> None:
 
 
 def test_short_disconnection_is_detected() -> None:
-    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    device = FaultyDevice("test", numbered, rate_hz=1000)
     with device.open() as camera:
         camera.start()
         device.unplug()
@@ -138,10 +138,10 @@ def test_short_disconnection_is_detected() -> None:
 def test_faults_have_the_set_rates_and_are_reproducible() -> None:
     def fates(seed: int) -> list[str]:
         faults = Faults(garbage=0.2, dropped=0.1, seed=seed)
-        device = SimulatedDevice("test", numbered, faults=faults)
+        device = FaultyDevice("test", numbered, faults=faults)
         results = []
         for _ in range(2000):
-            image, fate = device.expose()
+            image, fate = device.transfer()
             is_complete = image.shape == (24, 32) and image.dtype == np.uint8
             results.append(fate or ("whole" if is_complete else "garbage"))
         return results
@@ -156,7 +156,7 @@ def test_faults_have_the_set_rates_and_are_reproducible() -> None:
 
 
 def test_broken_frames_are_reported_and_lost_frames_leave_gaps() -> None:
-    device = SimulatedDevice("test", numbered, rate_hz=1000, faults=Faults(0.3, 0.3, seed=5))
+    device = FaultyDevice("test", numbered, rate_hz=1000, faults=Faults(0.3, 0.3, seed=5))
     with device.open() as camera:
         camera.start()
         numbers, broken = [], 0

@@ -35,7 +35,7 @@ from labapp.gui.widgets.labels import (
     show_words,
     wrapping_label,
 )
-from labapp.gui.widgets.layouts import fill, hbox, vbox
+from labapp.gui.widgets.layouts import column_of, fill, hbox
 from labapp.gui.widgets.tables import FullTable, ReadTable
 from labapp.gui.workspace import Workspace
 from labapp.media import read_picture
@@ -70,9 +70,8 @@ class BenchCheckPage(Page):
         self._overlays: list[pg.GraphicsObject] = []
         self.legend, self.pointed = Message(2), Message(1)
         self.quantities = _QuantityTable()
-        left, self.found = QWidget(), QWidget()
-        vbox((self.view, 1), self.legend, self.pointed, of=left)
-        vbox((self.quantities, 1), wrapping_label(presenter.LEGEND), of=self.found)
+        left = column_of((self.view, 1), self.legend, self.pointed)
+        self.found = column_of((self.quantities, 1), wrapping_label(presenter.LEGEND))
         self.splitter = QSplitter(Qt.Orientation.Horizontal)
         self.splitter.setChildrenCollapsible(False)
         self.splitter.addWidget(left)
@@ -309,10 +308,9 @@ class BenchCheckPage(Page):
         tip = "Which quantity is off; those in the list explain the dots equally well"
         self.suspect = ChoiceField("What is off", tooltip=tip)
         tip = "Check again with this quantity free: its entered value is ignored"
-        self.suspect_part = QWidget()
         find = button("Find it from the pictures", tip, self.find_suspect)
         # Names are long, so the label is above them.
-        vbox(self.suspect.label, self.suspect, find, of=self.suspect_part)
+        self.suspect_part = column_of(self.suspect.label, self.suspect, find)
         return self.suspect_part
 
     def _choose(self) -> None:

@@ -11,8 +11,8 @@ from PySide6.QtWidgets import QPlainTextEdit, QWidget
 from labapp.gui.foot_switches import DOES, FootSwitches, pedal_name
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import selectable_label, show_words
-from labapp.gui.widgets.layouts import Group, fill, hbox, vbox
+from labapp.gui.widgets.labels import heading, selectable_label, show_words
+from labapp.gui.widgets.layouts import Group, column_of, fill, hbox
 from labapp.media.devices.foot_switch import PedalAction
 from labapp.media.devices.hid import commands
 
@@ -49,15 +49,12 @@ class FootSwitchPanel(Group):
         self.look_button = button(
             "Find devices", "List the foot switches that are plugged in", self.switches.look
         )
-        form = FieldForm()
         self.action = ChoiceField(
             "Action", list(DOES.items()), tooltip="What stepping on this pedal does from now on"
         )
-        form.add(self.action)
         self.use_button = button("Apply", "Use this pedal, now and after every start", self._use)
         leave = button("Discard", "Leave this pedal as it is", self.switches.give_up)
-        self.learned = QWidget()
-        vbox(form, hbox(self.use_button, leave), of=self.learned)
+        self.learned = column_of(FieldForm(self.action), hbox(self.use_button, leave))
         # The buttons are above the text, whose height varies.
         fill(
             self.column,
@@ -66,11 +63,9 @@ class FootSwitchPanel(Group):
         )
 
     def _make_rights(self) -> None:
-        form = FieldForm()
         self.closed = ChoiceField(
             "No permission", tooltip="Devices that you have no permission to read: choose yours"
         )
-        form.add(self.closed)
         self.commands = QPlainTextEdit()
         self.commands.setReadOnly(True)
         self.commands.setTabChangesFocus(True)
@@ -87,8 +82,7 @@ class FootSwitchPanel(Group):
         )
         self.closed.edited.connect(lambda _: self._show_commands())
         then = selectable_label("Then unplug it and plug it in again.")
-        self.rights = QWidget()
-        vbox(form, self.commands, self.copy_button, then, of=self.rights)
+        self.rights = column_of(FieldForm(self.closed), self.commands, self.copy_button, then)
         self.column.addWidget(self.rights)
 
     # --- what is shown ------------------------------------------------------------------------
@@ -127,7 +121,7 @@ class FootSwitchPanel(Group):
             headed_by = ""
             for key, pedal in sorted(wanted):
                 if len(held) > 1 and key != headed_by:
-                    form.add_heading(held[key].name)
+                    form.add(heading(held[key].name))
                     headed_by = key
                 name = pedal_name(pedal, held[key].keyboard)
                 field = self.pedals[key, pedal] = ChoiceField(

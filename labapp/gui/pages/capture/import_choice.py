@@ -58,7 +58,6 @@ class ImportChoice(Group):
         self.hide()
 
     def _form(self) -> FieldForm:
-        form = FieldForm()
         self.first = whole("First frame", 0, "The first frame to use, counted from 0")
         self.last = whole("Last frame", 0, "The last frame to use")
         self.every = whole("Every n-th", 1, "1: every frame; 2: every second one…")
@@ -71,10 +70,10 @@ class ImportChoice(Group):
             tooltip="The rate it was filmed at, where the recording does not say so, or says it "
             "wrongly; empty: the recording's own",
         )
-        for field in (self.first, self.last, self.every, self.rate):
-            form.add(field)
+        fields = self.first, self.last, self.every, self.rate
+        for field in fields:
             field.edited.connect(lambda _: self.edited.emit())
-        return form
+        return FieldForm(*fields)
 
     def begin(self, preview: Preview) -> None:
         """Start with all frames of a recording."""

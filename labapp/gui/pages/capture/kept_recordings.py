@@ -22,16 +22,14 @@ class KeptRecordings(Group):
     def __init__(
         self, look: Callable[[Path], object], begin_next: Callable[[Path], object]
     ) -> None:
-        form = FieldForm()
         self.choice = ChoiceField("Beside the session", tooltip="Recordings not in the session")
-        form.add(self.choice)
         see = button(
             "Preview",
             "Show its frames, and choose which of them to import",
             lambda: look(Path(self.choice.value())),
         )
         begin = button(NEXT, NEXT_TIP, lambda: begin_next(Path(self.choice.value())))
-        super().__init__("Other recordings", form, see, begin)
+        super().__init__("Other recordings", FieldForm(self.choice), see, begin)
         self.hide()
 
     def list_beside(self, session: Session, running: Take | None) -> None:

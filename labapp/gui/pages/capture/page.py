@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from PySide6.QtCore import Qt, QTimer
+from PySide6.QtCore import QSignalBlocker, Qt, QTimer
 from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import QGridLayout, QSlider
 
@@ -302,10 +302,9 @@ class CapturePage(Page):
             self._drop_preview()
             self.preview = preview
             last = preview.frames - 1
-            self.slider.blockSignals(True)
-            self.slider.setRange(0, last)
-            self.slider.setValue(0)
-            self.slider.blockSignals(False)
+            with QSignalBlocker(self.slider):
+                self.slider.setRange(0, last)
+                self.slider.setValue(0)
             self.chosen.begin(preview)
             self._look()
             if at_once:

@@ -93,10 +93,8 @@ class LinesPanel(QWidget):
             tooltip="Its number in the pattern, growing towards the head; empty: found by the "
             "fit. Pieces of one line have the same",
         )  # fmt: skip
-        form = FieldForm()
-        form.add(self.number)
         vbox(
-            *(self.seen, self.why, heading("Correct"), self.chosen, form),
+            *(self.seen, self.why, heading("Correct"), self.chosen, FieldForm(self.number)),
             button_grid(edits, self.buttons),
             *(heading("Lines, from the top down"), self.lines),
             *(heading("What they show"), self.rows, 1),

@@ -72,14 +72,17 @@ class DotsPanel(QWidget):
             "At most", "frames", lowest=1, highest=1_000_000, decimals=0, optional=True,
             tooltip="Carry on over no more frames than this; empty: to the end of the recording",
         )  # fmt: skip
-        form = FieldForm()
-        form.add(self.most)
         self.rows = _RowList()
         self.rows.addActions(edits)
         vbox(
             *(self.seen, heading("Correct"), self.chosen, self._sites()),
             button_grid(edits, self.buttons),
-            *(heading("Following frames"), form, button_grid(frames, self.buttons), self.carried),
+            *(
+                heading("Following frames"),
+                FieldForm(self.most),
+                button_grid(frames, self.buttons),
+                self.carried,
+            ),
             *(heading("Fit"), self.fit, heading("Rows"), self.rows),
             *(heading("Detector"), self._detector(), 1),
             of=self,
@@ -181,15 +184,12 @@ class DotsPanel(QWidget):
         return None if row is None or column is None else (int(row), int(column))
 
     def _detector(self) -> FieldForm:
-        form = FieldForm()
         self.method = ChoiceField(
             "Method", METHODS, tooltip="How dots are found in frames not corrected by hand"
         )
-        form.add(self.method)
         self.row_search = ChoiceField(
             "Rows", ROW_SEARCHES, tooltip="How rows are found in frames not corrected by hand"
         )
-        form.add(self.row_search)
         self.numbers = []
         for number in NUMBERS:
             field = NumberField(
@@ -197,9 +197,8 @@ class DotsPanel(QWidget):
                 step=number.step, decimals=number.decimals, tooltip=number.tooltip,
                 optional=number.optional,
             )  # fmt: skip
-            form.add(field)
             self.numbers.append(field)
-        return form
+        return FieldForm(self.method, self.row_search, *self.numbers)
 
 
 def button_grid(actions: Sequence[QAction], buttons: dict[str, QToolButton]) -> QGridLayout:

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtCore import QUrl
+from PySide6.QtCore import QSignalBlocker, QUrl
 from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QCheckBox, QGridLayout, QWidget
 
@@ -118,9 +118,8 @@ class ExportPage(Page):
     def _lock_choices(self, why: str) -> None:
         """Disable and untick all boxes, with the reason; empty: show the ticks of the request."""
         for key, box in self._boxes.items():
-            box.blockSignals(True)
-            box.setChecked(key in self.request.ticked and not why)
-            box.blockSignals(False)
+            with QSignalBlocker(box):
+                box.setChecked(key in self.request.ticked and not why)
             box.setEnabled(not why and (key != "solid" or self.request.has_mesh))
             box.setToolTip(why or self._tips[key])
         for each in self._tick_buttons:
@@ -183,9 +182,8 @@ class ExportPage(Page):
     def _tick(self, on: bool) -> None:
         """Tick everything, or nothing."""
         for box in self._boxes.values():
-            box.blockSignals(True)
-            box.setChecked(on)
-            box.blockSignals(False)
+            with QSignalBlocker(box):
+                box.setChecked(on)
         self._ticked()
 
     def choose_folder(self) -> None:
@@ -269,7 +267,6 @@ class ExportPage(Page):
         self.canvas_layout.addWidget(scrolled(inner, "What is exported"))
 
     def _make_panel(self) -> None:
-        form = FieldForm()
         self.which = ChoiceField("Frames", WHICH, tooltip="Which frames to write")
         self.first = whole("From frame", 0, "The first frame to write")
         self.last = whole("To frame", 0, "The last frame to write")
@@ -303,7 +300,7 @@ class ExportPage(Page):
         }
         for name, field in fields.items():
             field.edited.connect(partial(self._enter, name))
-            form.add(field)
+        form = FieldForm(*fields.values())
         self.folder = PathField(
             "Folder",
             tooltip="A new or empty folder, or an earlier export, which is replaced",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import QHeaderView, QStackedWidget, QTableWidget, QTableWidgetItem, QWidget
 
@@ -123,10 +123,8 @@ class LaserPage(Page):
     # --- the panel --------------------------------------------------------------------------
 
     def _make_panel(self) -> None:
-        form = FieldForm()
         self.way = ChoiceField("Lengths", WAYS, tooltip="Where the lengths of the cross come from")
         self.way.edited.connect(self._show_way)
-        form.add(self.way)
         self.fan = NumberField(
             "Fan angle, full",
             "°",
@@ -157,7 +155,7 @@ class LaserPage(Page):
         )
         for each in (self.fan, self.fan_sigma, self.resolution):
             each.edited.connect(lambda _: self._follow())
-            form.add(each)
+        form = FieldForm(self.way, self.fan, self.fan_sigma, self.resolution)
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
         readings = wrapping_label("Readings, mm: three lines or more")
@@ -173,10 +171,8 @@ class LaserPage(Page):
         self.lock_with_session(self.fan, self.fan_sigma, self.resolution, self.table)
 
     def _picture_part(self) -> QWidget:
-        self.picture_part = FieldForm()
         tip = "A picture of the cross hair beside a scale"
-        self.picture_part.add_wide(button("Load picture…", tip, self._choose_picture))
-        self.picture_part.add_wide(self.answer)
+        load = button("Load picture…", tip, self._choose_picture)
         self.scale = NumberField(
             "Scale length",
             "mm",
@@ -188,12 +184,10 @@ class LaserPage(Page):
         )
         self.scale.set_value(10.0)
         self.scale.edited.connect(lambda _: self._dragged())
-        self.picture_part.add(self.scale)
         self.lengths = Message(2)
-        self.picture_part.add_wide(self.lengths)
         tip = "Add these lengths to the table as a further reading"
         self.add_button = button("Add as a reading", tip, self.add_reading)
-        self.picture_part.add_wide(self.add_button)
+        self.picture_part = FieldForm(load, self.answer, self.scale, self.lengths, self.add_button)
         return self.picture_part
 
     def _show_way(self, way: str) -> None:
@@ -206,29 +200,26 @@ class LaserPage(Page):
 
     def _fill(self, readings: Readings) -> None:
         count = max(map(len, readings.lengths_mm))
-        self.table.blockSignals(True)
-        self.table.setRowCount(0)
-        self.table.setRowCount(max(LEAST_ROWS, count + 1))
-        for column, lengths in enumerate(readings.lengths_mm):
-            for row, length in enumerate(lengths):
-                self.table.setItem(row, column, _cell(_length(length)))
-        self.table.blockSignals(False)
+        with QSignalBlocker(self.table):
+            self.table.setRowCount(0)
+            self.table.setRowCount(max(LEAST_ROWS, count + 1))
+            for column, lengths in enumerate(readings.lengths_mm):
+                for row, length in enumerate(lengths):
+                    self.table.setItem(row, column, _cell(_length(length)))
         self.table.fit()
         self.fan.set_value(readings.fan_angle_deg)
         self.fan_sigma.set_value(readings.settings.fan_angle_sigma_deg)
         self.resolution.set_value(readings.settings.resolution_mm)
 
     def _put(self, row: int, texts: list[str]) -> None:
-        self.table.blockSignals(True)
-        for column, text in enumerate(texts):
-            self.table.setItem(row, column, _cell(text))
-        self.table.blockSignals(False)
+        with QSignalBlocker(self.table):
+            for column, text in enumerate(texts):
+                self.table.setItem(row, column, _cell(text))
         self._grow()
 
     def _cell_changed(self, item: QTableWidgetItem) -> None:
-        self.table.blockSignals(True)
-        item.setTextAlignment(RIGHT)
-        self.table.blockSignals(False)
+        with QSignalBlocker(self.table):
+            item.setTextAlignment(RIGHT)
         self._from_picture = None
         self._grow()
         self._follow()

@@ -164,16 +164,9 @@ class PlanePage(Page):
     # --- the panel --------------------------------------------------------------------------
 
     def _make_panel(self) -> None:
-        form = FieldForm()
-        form.add_wide(
-            button(
-                "Load picture…",
-                "A picture of the target, taken by the camera in its place",
-                self._choose,
-            )
-        )
+        tip = "A picture of the target, taken by the camera in its place"
+        load = button("Load picture…", tip, self._choose)
         self.kept_button = button("Picture in use", "", self.take_kept)
-        form.add_wide(self.kept_button)
         self.unit = NumberField(
             "Unit of the axes",
             "mm",
@@ -185,20 +178,23 @@ class PlanePage(Page):
         )
         self.unit.set_value(presenter.UNIT_MM)
         self.unit.edited.connect(lambda _: self._unit_changed())
-        form.add(self.unit)
-        self._add_board_fields(form)
+        self._make_board_fields()
         self.find_button = button(
             "Find O′ and the axes",
             "Look for the dot and the two bars in the picture",
             self.find_axes,
         )
-        form.add_wide(self.find_button)
-        form.add_wide(self.answer)
-        fill(self.panel_layout, form)
+        fill(
+            self.panel_layout,
+            FieldForm(
+                *(load, self.kept_button, self.unit, self.square, self.add_button),
+                *(self.find_button, self.answer),
+            ),
+        )
         self._make_results()
         self.lock_with_session(self.unit, self.square)
 
-    def _add_board_fields(self, form: FieldForm) -> None:
+    def _make_board_fields(self) -> None:
         self.square = NumberField(
             "Square of the board",
             "mm",
@@ -209,42 +205,26 @@ class PlanePage(Page):
             tooltip="Edge of a square: measure ten of them on the printed board",
         )
         self.square.edited.connect(lambda _: self._square_changed())
-        form.add(self.square)
-        self.add_button = button(
-            "Add picture of the board…",
-            ADD,
-            self._choose_further,
-        )
-        form.add_wide(self.add_button)
+        self.add_button = button("Add picture of the board…", ADD, self._choose_further)
 
     def _print_form(self) -> FieldForm:
-        form = FieldForm()
         self.print = ChoiceField(
             "To print",
             tuple((name, name.replace("_", " ")) for name in PRINTS),
             tooltip="The dissertation's target, or a board: ChArUco boards may be seen in part",
         )
-        form.add(self.print)
-        form.add_wide(
-            button(
-                "Save for printing…",
-                "At true size (SVG or PDF): print it at 100 % and measure its unit or squares",
-                self._choose_target,
-            )
-        )
+        tip = "At true size (SVG or PDF): print it at 100 % and measure its unit or squares"
+        save = button("Save for printing…", tip, self._choose_target)
         self.saved = Message(2)
-        form.add_wide(self.saved)
-        return form
+        return FieldForm(self.print, save, self.saved)
 
     def _make_results(self) -> None:
-        model = FieldForm()
         self.model = ChoiceField(
             "Use",
             presenter.choices(None),
             tooltip="How pixels map to the plane: a fit to the tick marks, or the three points",
         )
         self.model.edited.connect(self.choose_model)
-        model.add(self.model)
         self.use_button, self.applied = button("Apply", "", self.use), Message(2)
         help_text = wrapping_label(
             "Drag a point that is not right: O′ to the middle of the dot, the others to the "
@@ -255,7 +235,7 @@ class PlanePage(Page):
         self.in_use = ResultTable("Image calibration in use")
         fill(
             self.panel_layout,
-            *(model, self.use_button, self.applied, help_text, self._print_form()),
+            *(FieldForm(self.model), self.use_button, self.applied, help_text, self._print_form()),
             *(self.words, self.result, self.why, plain_label("In use now"), self.in_use, 1),
         )
 

@@ -28,7 +28,7 @@ from labapp.gui.views.drawings.pattern import PatternView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_label
-from labapp.gui.widgets.layouts import fill, hbox, vbox
+from labapp.gui.widgets.layouts import column_of, fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick, ticked
@@ -199,7 +199,6 @@ class SetupPage(Page):
             (self.ticks | self.steps)[item].setChecked(not on)
 
     def _bench(self) -> QWidget:
-        form = FieldForm()
         load = button("Load…", "Take all of the set-up from a setup file (TOML)", self._choose_load)
         save = button("Save…", "Write the set-up to a file, for another session", self._choose_save)
         usual = button(
@@ -208,25 +207,19 @@ class SetupPage(Page):
             self._use_defaults,
         )
         self._filling = load, usual
-        buttons = QWidget()
-        vbox(hbox(load, save), usual, of=buttons)
-        form.add_wide(buttons)
-        form.add_wide(self.answer)
-        self.status = Message(3)
-        form.add_wide(self.status)
-        self.sigma_words = Message(2)
-        form.add_wide(self.sigma_words)
+        self.status, self.sigma_words = Message(3), Message(2)
+        buttons = column_of(hbox(load, save), usual)
+        form = FieldForm(buttons, self.answer, self.status, self.sigma_words)
         for title, entries in RIG:
-            form.add_heading(title)
+            form.add(heading(title))
             if title == "Pattern":
                 tip = (
                     "Dots, and how they lie to each other, or lines. "
                     "Measured rays come with a setup file: Load…"
                 )
                 self.kind = self._choice("Kind", KINDS, tip, presenter.put_kind)
-                form.add(self.kind)
                 self.pattern = PatternView()
-                form.add_wide(self.pattern)
+                form.add(self.kind, self.pattern)
             for entry in entries:
                 field = self.rig_fields[entry.key] = self._put_field(entry)
                 sigma = presenter.sigma_entry(entry)
@@ -236,23 +229,20 @@ class SetupPage(Page):
                 self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)
                 form.add(self.travel)
         title, entries = UNCERTAIN_ONLY
-        form.add_heading(f"{title}, ±")
+        form.add(heading(f"{title}, ±"))
         for entry in entries:
             form.add(self._sigma_field(entry))
-        form.add_heading("Expected pool")
+        form.add(heading("Expected pool"))
         for entry in POOL:
             self._add_noted(form, entry)
-        form.add_wide(
-            button(
-                "Advise…",
-                "Where laser and plane should stand for such pools (Ctrl+Shift+A)",
-                lambda: self.workspace.action_requested.emit("adviser"),
-            )
+        advise = button(
+            "Advise…",
+            "Where laser and plane should stand for such pools (Ctrl+Shift+A)",
+            lambda: self.workspace.action_requested.emit("adviser"),
         )
         self.table = ResultTable("Rays that reach the imaging plane")
-        form.add_wide(self.table)
         self.others = wrapping_label()
-        form.add_wide(self.others)
+        form.add(advise, self.table, self.others)
         return form
 
     def _choice(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QPointF, Qt, Signal
+from PySide6.QtCore import QPointF, QSignalBlocker, Qt, Signal
 
 from labapp.core.surface.boundary import Boundary
 from labapp.core.values import FloatArray
@@ -94,11 +94,10 @@ class PlanChart(Chart):
             QPointF(*(end * np.array(way) + offset_mm * np.array(aside)))
             for end in (reach.min() * 1.15, reach.max() * 1.15)
         ]
-        self._line.blockSignals(True)
-        self._line.setPos(0.0, 0.0, finish=False)
-        for handle, end in zip(self._line.getHandles(), ends, strict=True):
-            self._line.movePoint(handle, end, finish=False, coords="parent")
-        self._line.blockSignals(False)
+        with QSignalBlocker(self._line):
+            self._line.setPos(0.0, 0.0, finish=False)
+            for handle, end in zip(self._line.getHandles(), ends, strict=True):
+                self._line.movePoint(handle, end, finish=False, coords="parent")
 
     def _moved(self) -> None:
         a, b = (self._line.mapToParent(handle.pos()) for handle in self._line.getHandles())

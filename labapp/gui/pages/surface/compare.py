@@ -14,7 +14,7 @@ from labapp.gui.views.view3d import View3d
 from labapp.gui.views.view3d_kinds import make_view3d
 from labapp.gui.widgets.fields import ChoiceField
 from labapp.gui.widgets.labels import wrapping_label
-from labapp.gui.widgets.layouts import hbox, vbox
+from labapp.gui.widgets.layouts import column_of, hbox, row_of, vbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.widgets.tables import ReadTable
 from labapp.gui.workspace import Workspace
@@ -43,10 +43,9 @@ class CompareView(QWidget):
                     view.camera_changed.connect(other.set_camera)
         for box in (self.first, self.second):
             box.choice.edited.connect(lambda _: self.refresh(self._options))
-        figures = QWidget()
-        vbox(self.words, (self.table, 1), of=figures)
-        surfaces = _side_by_side(self.first, self.second)
-        below = _side_by_side(self.difference, figures)
+        figures = column_of(self.words, (self.table, 1))
+        surfaces = row_of((self.first, 1), (self.second, 1))
+        below = row_of((self.difference, 1), (figures, 1))
         self.parts = PartsBar(
             "What is seen of the comparison",
             {
@@ -127,13 +126,6 @@ class CompareView(QWidget):
     def _make_room(self) -> None:
         wanted = self.table.full_height
         self.table.setMinimumHeight(min(wanted, self.height() * 2 // 5))
-
-
-def _side_by_side(*widgets: QWidget) -> QWidget:
-    """Widgets of equal width."""
-    line = QWidget()
-    hbox(*((widget, 1) for widget in widgets), of=line)
-    return line
 
 
 class _SchemeBox(QWidget):

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from PySide6.QtCore import QSize, Qt, QTimer
+from PySide6.QtCore import QSignalBlocker, QSize, Qt, QTimer
 from PySide6.QtGui import (
     QAction,
     QHideEvent,
@@ -54,7 +54,7 @@ from labapp.gui.views.view3d_kinds import make_view3d
 from labapp.gui.widgets.buttons import add_action, tool_button
 from labapp.gui.widgets.fields import ChoiceField, NumberField
 from labapp.gui.widgets.labels import Message
-from labapp.gui.widgets.layouts import fill, hbox, vbox
+from labapp.gui.widgets.layouts import column_of, fill, hbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 from labapp.session.results.measured import scheme_name
@@ -131,8 +131,7 @@ class SurfacePage(Page):
     def _single(self) -> QWidget:
         left, right = QSplitter(Qt.Orientation.Vertical), QSplitter(Qt.Orientation.Vertical)
         whole = QSplitter(Qt.Orientation.Horizontal)
-        below = QWidget()
-        vbox(self._section_fields(), (self.profile, 1), of=below)
+        below = column_of(self._section_fields(), (self.profile, 1))
         for splitter, widgets, sizes in (
             (left, (self.view, below), (5, 3)),
             (right, (self.dots, self.plan), (1, 1)),
@@ -151,9 +150,7 @@ class SurfacePage(Page):
                 "Dots": (right, self.dots),
             },
         )
-        canvas = QWidget()
-        vbox(self.canvas_parts, (whole, 1), of=canvas)
-        return canvas
+        return column_of(self.canvas_parts, (whole, 1))
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Show parts of a narrow canvas one at a time."""
@@ -388,9 +385,8 @@ class SurfacePage(Page):
         self.high.set_value(high)
         self.true_scale.setChecked(high == 1.0)
         for name, action in self.drawn_items.items():
-            action.blockSignals(True)
-            action.setChecked(getattr(self.options, name))
-            action.blockSignals(False)
+            with QSignalBlocker(action):
+                action.setChecked(getattr(self.options, name))
         if self.options.section is not None:
             self.angle.set_value(self.options.section[0])
             self.offset.set_value(self.options.section[1])

@@ -48,9 +48,7 @@ class SurfacePanel:
         )
         self.scheme.edited.connect(self._choose_scheme)
         self.correspondence.edited.connect(self._choose_correspondence)
-        form = FieldForm()
-        form.add(self.scheme)
-        form.add(self.correspondence)
+        form = FieldForm(self.scheme, self.correspondence)
         self.status, self.setup_words = wrapping_label(), wrapping_label()
         self.provenance, self.verdict = wrapping_label(), wrapping_label()
         self._stale = False
