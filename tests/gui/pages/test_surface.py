@@ -298,7 +298,9 @@ def test_two_schemes_are_shown_side_by_side(page: SurfacePage, qtbot: QtBot) -> 
     before = compare.words.text()
     compare.second.choice.set_value("irs-opa")
     compare.second.choice.edited.emit("irs-opa")
+    assert not compare.table.isEnabled()  # these are the former figures
     qtbot.waitUntil(lambda: "IRS" in compare.words.text())
+    assert compare.table.isEnabled()
     assert compare.words.text() != before
     page.workspace.show_frame(5)
     qtbot.waitUntil(lambda: not page.workspace.tasks.active)

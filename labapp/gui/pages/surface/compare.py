@@ -78,6 +78,7 @@ class CompareView(QWidget):
             return
         self._shown_for, self._options = wanted, options
         self.words.setText("Computing…")
+        self.table.setEnabled(False)  # its figures are still those of another frame
         if self._task is not None:
             self._task.cancel()
 
@@ -115,6 +116,7 @@ class CompareView(QWidget):
                 tip = f"{row[0]}: {text} {row[4] if number else ''}".strip()
                 self.table.set_cell(k, column, text, number=number, tip=tip)
         self.table.resizeRowsToContents()
+        self.table.setEnabled(True)
         self._make_room()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
