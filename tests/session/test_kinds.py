@@ -119,6 +119,52 @@ def test_edited_columns_of_a_result_are_detected(path: Path, edit: str):
         assert len(session.problems()) == 1
 
 
+def edit(path: Path, statement: str) -> None:
+    """Edit a session as another program could, without its constraints."""
+    connection = sqlite3.connect(path, isolation_level=None)
+    connection.execute("PRAGMA ignore_check_constraints = ON")
+    connection.execute(statement)
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    "statement", ["UPDATE frame SET time_s = 7 WHERE number = 1", "DELETE FROM recording"]
+)
+def test_changed_times_are_not_exported(path: Path, statement: str):
+    edit(path, statement)
+    with Session.open(path, read_only=True) as session:
+        with pytest.raises(InputError, match="frames"):
+            session.export(path.with_name("out"))
+        with pytest.raises(InputError, match="frames"):
+            list(session.frame_results())
+    assert not path.with_name("out").exists()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    ["UPDATE result SET inputs = x''", "DELETE FROM detail", "UPDATE detail SET result = -result"],
+)
+def test_incomplete_result_is_damaged(path: Path, statement: str):
+    edit(path, statement)
+    with Session.open(path) as session:
+        for use in (
+            lambda: session.result(0, "fit"),
+            lambda: session.export(path.with_name("out")),
+        ):
+            with pytest.raises(InputError):
+                use()
+        # Damaged results have no part in the check of the set-up.
+        assert [found.status for _, found in session.measure([2])] == ["no-dots"]
+
+
+def test_name_of_a_scheme_that_is_no_text_is_damage(path: Path):
+    edit(path, "UPDATE result SET scheme = x'00ff'")
+    with Session.open(path) as session:
+        with pytest.raises(InputError, match="results"):
+            _ = session.measured_by
+        assert session.measure([2])
+
+
 def test_overview_works_with_damaged_inputs(path: Path):
     with Session.open(path) as session, session._database.transaction() as connection:
         connection.execute("UPDATE inputs SET settings = 'text' WHERE id = 1")
