@@ -185,6 +185,7 @@ def test_undo_reports_a_damaged_history(path: Path):
         with pytest.raises(InputError, match="settings in the history"):
             session.undo()
         assert session.settings.scheme == "irs"
+        assert session.problems() != []
 
 
 def test_other_journal_mode_is_rejected_without_new_files(path: Path):
