@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.pipeline import Settings
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
@@ -31,6 +32,8 @@ def blob_of(tree: object) -> bytes:
     ("value", "hint", "fits"),
     [
         (1, float, True),
+        (10**30, float, False),
+        (-(10**30), int, False),
         (True, float, False),
         (1.0, int, False),
         (None, str | None, True),
@@ -84,6 +87,21 @@ def test_highly_compressed_blob_is_rejected():
     body = b"".join(packer.compress(bytes(1 << 24)) for _ in range(10)) + packer.flush()
     with pytest.raises(Damaged, match="too large"):
         unpack(HEAD.pack(MAGIC, zlib.crc32(body)) + body)
+
+
+@pytest.mark.parametrize(
+    "marks",
+    [
+        ((0.0, float("inf"), 1.0, 1.0, 1.0),) * 5,
+        ((0.0, 0.0, 1e300, 1.0, 1.0),) * 5,
+        ((0.0, 0.0, 1.0, 1.0, 1.0),) * 3,
+    ],
+)
+def test_marks_that_determine_no_map_are_damaged(marks: Any):
+    points: Any = ((44.0, 590.0), (242.0, 588.0), 34.9, (43.0, 500.0), 15.9, (0.1, 0.1, 0.1), 90.0)
+    assert unpack(pack(PlaneCalibration(*points)))
+    with pytest.raises(Damaged):
+        unpack(pack(PlaneCalibration(*points, marks, "affine")))
 
 
 @pytest.fixture

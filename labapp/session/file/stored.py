@@ -51,6 +51,9 @@ from labapp.session.record import (
 )
 from labapp.session.signals import Signals
 
+LARGEST_PX = 1e6
+"""Limit of the coordinates of a calibration, px and mm."""
+
 
 @dataclass(frozen=True)
 class Stored:
@@ -111,6 +114,15 @@ def _corners_fit(value: Any) -> bool:
     return _all_within(value.index, 0, len(value.board.corners_mm) - 1)
 
 
+def _plane_fits(value: Any) -> bool:
+    """Whether the points and marks of a calibration determine a map."""
+    numbers = (*value.origin_px, *value.x_axis_px, *value.z_axis_px, *value.sigma_px)
+    lengths = (value.x_axis_mm, value.z_axis_mm, *(one for mark in value.marks for one in mark))
+    return _all_within(np.array([*numbers, *lengths]), -LARGEST_PX, LARGEST_PX) and bool(
+        np.isfinite(value.image_calibration.matrix).all()
+    )
+
+
 def _boards_fit(value: Any) -> bool:
     return bool(
         1 <= len(value.seen) <= MOST_PICTURES
@@ -138,7 +150,7 @@ def _line_correction_fits(value: Any) -> bool:
     return len(value.number) == len(lines) and all(len(one.image_px) > 1 for one in lines)
 
 
-def _all_within(numbers: Any, least: int, most: int) -> bool:
+def _all_within(numbers: Any, least: float, most: float) -> bool:
     return bool(((numbers >= least) & (numbers <= most)).all())
 
 
@@ -159,7 +171,7 @@ STORED = {
     "LaserReadings": Stored(LaserReadings),
     "LaserCalibration": Stored(LaserCalibration),
     "PlanePicture": Stored(PlanePicture),
-    "PlaneCalibration": Stored(PlaneCalibration),
+    "PlaneCalibration": Stored(PlaneCalibration, fits=_plane_fits),
     "BoardCalibration": Stored(BoardCalibration, fits=_boards_fit),
     "BoardCorners": Stored(
         BoardCorners, shapes={"index": "n", "image_px": "n 2"}, fits=_corners_fit
