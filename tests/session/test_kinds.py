@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from labapp.core.calibration.boards import Board, BoardCorners
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.pipeline import Settings
 from labapp.core.values import FloatArray
@@ -102,6 +103,15 @@ def test_marks_that_determine_no_map_are_damaged(marks: Any):
     assert unpack(pack(PlaneCalibration(*points)))
     with pytest.raises(Damaged):
         unpack(pack(PlaneCalibration(*points, marks, "affine")))
+
+
+@pytest.mark.parametrize("factor", [np.nan, np.inf, 1e300, 0.0, (1.0, 0.0)])
+def test_corners_that_determine_no_map_are_damaged(factor: Any):
+    board = Board("a", "charuco", 9, 7, 10.0, "4X4_50", 0)
+    index = np.arange(len(board.corners_mm))
+    assert unpack(pack(BoardCorners(board, index, board.corners_mm * 8.0 + 50)))
+    with pytest.raises(Damaged):
+        unpack(pack(BoardCorners(board, index, (board.corners_mm * 8.0 + 50) * factor)))
 
 
 @pytest.fixture

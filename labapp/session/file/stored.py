@@ -111,7 +111,16 @@ def _spline_fits(value: Any) -> bool:
 
 
 def _corners_fit(value: Any) -> bool:
-    return _all_within(value.index, 0, len(value.board.corners_mm) - 1)
+    """Whether the corners are those of the board, and not on a line in the picture."""
+    return (
+        len(value.index) > 2
+        and _all_within(value.index, 0, len(value.board.corners_mm) - 1)
+        and _all_within(value.image_px, -LARGEST_PX, LARGEST_PX)
+        and all(
+            np.linalg.matrix_rank(places - places.mean(axis=0)) == 2
+            for places in (value.plane_mm, value.image_px)
+        )
+    )
 
 
 def _plane_fits(value: Any) -> bool:
