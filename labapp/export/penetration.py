@@ -5,17 +5,19 @@ A model file is JSON with numbers and names; nothing in it is ever executed.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from labapp.config.toml_keys import Rule, between, is_number, one_of, shown, whole, within
 from labapp.core.dynamics.penetration import ModelSettings, PenetrationModel, Prediction
 from labapp.core.dynamics.static_maps import MOST_POINTS, GaussianMap, LinearMap
 from labapp.core.dynamics.weld_series import LONGEST_MEMORY, MOST_HELD, Orders, WeldSeries
@@ -32,6 +34,9 @@ FORMAT = 1
 
 LARGEST = 1 << 25
 """Largest model file, bytes."""
+
+MOST = 1e12
+"""Limit of the numbers in arrays."""
 
 WANTED = "a penetration model, as `labapp penetration fit` writes it"
 
@@ -87,79 +92,152 @@ def read_model(path: str | os.PathLike[str]) -> PenetrationModel:
     path = Path(path)
     try:
         read = json.loads(read_limited(path, LARGEST, WANTED))
-        if read["program"] != "labapp" or read["format"] != FORMAT:
-            raise InputError(path, "format", read["format"], f"{FORMAT}, of this labapp")
-        return _model(read)
-    except InputError:
-        raise
-    except (ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
-        raise InputError(path, "content", f"{type(error).__name__}: {error}", WANTED) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, "syntax", error, WANTED) from error
+    file = _Fields(path, read)
+    file.get("program", one_of("labapp"))
+    file.get("format", Rule(f"{FORMAT}, of this labapp", lambda value: value == FORMAT))
+    return _model(file)
 
 
-def _model(read: Mapping[str, Any]) -> PenetrationModel:
-    """Return the model described by a file's content; raises `ValueError` and others."""
-    orders = Orders(*(_whole(read["orders"], name) for name in ("poles", "lags", "delay")))
-    features = tuple(map(str, read["features"]))
-    constants = tuple(_number(one, "time constants") for one in read["time_constants_s"])
-    full = None if read["full_mm"] is None else _number(read["full_mm"], "full_mm")
-    step_s = _number(read["step_s"], "step_s")
-    _check(0 < len(set(features)) == len(features) and set(features) <= set(WITH_SIGMA), "features")
-    _check(1e-4 <= step_s <= 100 and len(constants) == orders.poles <= 2, "step or poles")
-    _check(all(0 < one <= 1000 for one in constants), "time constants")
-    memory = 8 * sum(constants) / step_s + orders.delay + orders.lags
-    _check(orders.lags >= 1 and memory <= LONGEST_MEMORY, "orders")
-    _check(full is None or 0 < full < 1e6, "full_mm")
-    target = str(read["target"])
-    _check(target.replace("_", "").isalnum() and len(target) <= 50, "target")
-    width = orders.lags * len(features)
-    given = read["static"]
-    static: LinearMap | GaussianMap
-    if read["kind"] == "arx":
-        static = LinearMap(
-            _array(given["weights"], width + 1), _array(given["covariance"], width + 1, width + 1)
-        )
-    else:
-        _check(read["kind"] == "gp", "kind")
-        count = len(given["values"])
-        _check(0 < count <= MOST_POINTS, "points")
-        values, variances = (_array(given[key], count) for key in ("values", "variances"))
-        lengths, signal = _array(given["lengths"], width), _number(given["signal"], "kernel")
-        static = GaussianMap(
-            _array(given["points"], count, width), values, variances, lengths, signal
-        )
-        _check(bool((variances > 0).all() and (lengths > 0).all() and 0 < signal < 1e12), "kernel")
-        _check(bool(np.isfinite(static.weights).all()), "kernel")
-    center, scale, low, high = (_array(read[key], width) for key in ARRAYS)
-    mean, *others = (_number(read[key], key) for key in NUMBERS)
-    _check(bool((scale > 0).all()), "scale")
-    _check(all(0 <= one < 1e12 for one in (mean, *others)), "numbers")
-    settings = ModelSettings(features, target, step_s, orders, full)
+@dataclass(frozen=True)
+class _Fields:
+    """The fields of a JSON object of a file, checked one by one; errors have their full name."""
+
+    path: Path
+    content: Any
+    name: str = ""
+    """Name of the object; empty for the outermost."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.content, dict):
+            raise self.error("", shown(self.content), WANTED)
+
+    def error(self, key: str, value: object, expected: str) -> InputError:
+        """Return the error for a field; for the object itself without a key."""
+        field = ".".join(filter(None, (self.name, key)))
+        return InputError(self.path, field or "content", value, expected)
+
+    def get(self, key: str, rule: Rule) -> Any:
+        """Return a value that a rule accepts."""
+        if key not in self.content:
+            raise self.error(key, "missing", rule.expected)
+        value = self.content[key]
+        if not rule.accepts(value):
+            raise self.error(key, shown(value), rule.expected)
+        return value
+
+    def part(self, key: str) -> _Fields:
+        """Return the fields of an object in this one."""
+        value = self.get(key, Rule("an object with fields", lambda value: isinstance(value, dict)))
+        return _Fields(self.path, value, key)
+
+    def array(self, key: str, *shape: int, above: float = -MOST) -> FloatArray:
+        """Return an array of finite numbers above a limit."""
+        numbers = f"{' × '.join(map(str, shape))} numbers above {above:g} and below {MOST:g}"
+        values = self.get(key, Rule(numbers, lambda value: isinstance(value, list)))
+        try:
+            found = np.array(values)
+        except ValueError as error:  # rows of different lengths
+            raise self.error(key, error, numbers) from error
+        if found.shape != shape or found.dtype.kind not in "if":
+            kind = "numbers" if found.dtype.kind in "if" else "values"
+            raise self.error(key, f"{' × '.join(map(str, found.shape))} {kind}", numbers)
+        wrong = found[~((found > above) & (found < MOST))]
+        if len(wrong):
+            raise self.error(key, shown(wrong[0].item()), numbers)
+        return found.astype(float)
+
+
+def _model(file: _Fields) -> PenetrationModel:
+    """Return the model described by the fields of a file."""
+    kind = file.get("kind", one_of("arx", "gp"))
+    target = file.get("target", TARGET)
+    settings = ModelSettings(
+        tuple(file.get("features", FEATURES)),
+        target,
+        file.get("step_s", within(1e-4, 100, "s")),
+        Orders(**{key: file.part("orders").get(key, rule) for key, rule in ORDERS.items()}),
+        file.get("full_mm", FULL_MM),
+    )
+    orders = settings.orders
+    right = f"{orders.poles} numbers above 0 and up to 1000 (s)"
+    constants = tuple(file.get("time_constants_s", Rule(right, _are_time_constants)))
+    if len(constants) != orders.poles:
+        raise file.error("time_constants_s", shown(constants), f"{right}, as orders.poles says")
+    memory = 8 * sum(constants) / settings.step_s + orders.delay + orders.lags
+    if memory > LONGEST_MEMORY:
+        least = f"{LONGEST_MEMORY} steps or fewer, with the present time_constants_s and step_s"
+        raise file.error("orders", f"a memory of {memory:.0f} steps", least)
+    width = orders.lags * len(settings.features)
+    static = _static(file.part("static"), kind, width)
+    center, low, high = (file.array(key, width) for key in ("center", "low", "high"))
+    scale = file.array("scale", width, above=0)
+    if (low > high).any():
+        raise file.error("low", "above high", "the lower ends of the range, below those of high")
+    mean, *others = (float(file.get(key, within(0, 1e9, ""))) for key in NUMBERS)
     return PenetrationModel(
-        read["kind"], settings, constants, center, scale, low, high, mean, static, *others
+        kind, settings, constants, center, scale, low, high, mean, static, *others
     )
 
 
-def _check(is_right: bool, what: str) -> None:
-    if not is_right:
-        raise ValueError(f"impossible {what}")
+def _static(fields: _Fields, kind: str, width: int) -> LinearMap | GaussianMap:
+    """Return the map from ``width`` regressors to penetration."""
+    if kind == "arx":
+        weights = fields.array("weights", width + 1)
+        covariance = fields.array("covariance", width + 1, width + 1)
+        if not _is_covariance(covariance):
+            right = "a covariance matrix: symmetric, without negative eigenvalues"
+            raise fields.error("covariance", "another matrix", right)
+        return LinearMap(weights, covariance)
+    right = f"1 to {MOST_POINTS} numbers"
+    listed = Rule(right, lambda value: isinstance(value, list) and 0 < len(value) <= MOST_POINTS)
+    count = len(fields.get("values", listed))
+    values = fields.array("values", count)  # first, as it determines the shape of the others
+    static = GaussianMap(
+        fields.array("points", count, width),
+        values,
+        fields.array("variances", count, above=0),
+        fields.array("lengths", width, above=0),
+        float(fields.get("signal", between(0, 1e9, "mm²"))),
+    )
+    with contextlib.suppress(ValueError):  # from SciPy, of a singular covariance
+        if np.isfinite(static.weights).all():
+            return static
+    right = "points, variances, lengths and signal with a positive definite covariance"
+    raise fields.error("points", "singular covariance", right)
 
 
-def _whole(of: Mapping[str, Any], name: str) -> int:
-    value = of[name]
-    _check(type(value) is int and 0 <= value <= LONGEST_MEMORY, name)
-    return int(value)
+def _is_covariance(matrix: FloatArray) -> bool:
+    rounding = 1e-9 * np.abs(matrix).max()
+    is_symmetric = np.abs(matrix - matrix.T).max() <= rounding
+    return bool(is_symmetric and np.linalg.eigvalsh(matrix).min() >= -rounding)
 
 
-def _number(value: Any, name: str) -> float:
-    _check(type(value) in (int, float), name)  # not true, nor "1"
-    return float(value)
+def _are_features(value: object) -> bool:
+    if not (isinstance(value, list) and all(isinstance(one, str) for one in value)):
+        return False
+    return 0 < len(set(value)) == len(value) and set(value) <= set(WITH_SIGMA)
 
 
-def _array(values: Any, *shape: int) -> FloatArray:
-    found = np.array(values)
-    _check(found.shape == shape and found.dtype.kind in "if", "shape or number")
-    _check(bool((np.abs(found) < 1e12).all()), "number")
-    return found.astype(float)
+def _are_time_constants(value: object) -> bool:
+    return isinstance(value, list) and all(is_number(one) and 0 < one <= 1000 for one in value)
+
+
+def _is_target(value: object) -> bool:
+    return isinstance(value, str) and value.replace("_", "").isalnum() and len(value) <= 50
+
+
+FEATURES = Rule(f"different names, some of {', '.join(WITH_SIGMA)}", _are_features)
+TARGET = Rule("a name of letters, digits and _, at most 50", _is_target)
+FULL_MM = Rule(
+    "null or a number above 0 (mm)", lambda value: value is None or (is_number(value) and value > 0)
+)
+ORDERS = {
+    "poles": whole(0, 2),
+    "lags": whole(1, LONGEST_MEMORY),
+    "delay": whole(0, LONGEST_MEMORY),
+}
 
 
 # --- predictions --------------------------------------------------------------------------------

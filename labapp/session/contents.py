@@ -287,9 +287,15 @@ class SessionContents:
             ``fit``, ``ers``, ``irs-opa`` …; None: the scheme of the settings.
         frames
             Numbers of the frames; None: all.
+
+        Raises
+        ------
+        InputError
+            If a result is damaged, or numbers or times of the frames have changed.
         """
         from labapp.export.frame_result import FrameResult
 
+        self._frames.refuse_changed()
         chosen = frozenset(self.frames.tolist() if frames is None else frames)
         times = self.overview(scheme).time_s.tolist()
         for frame, time_s in zip(self.frames.tolist(), times, strict=True):

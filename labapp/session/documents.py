@@ -247,6 +247,15 @@ class Documents:
             for (kind, frame), content in expected.items()
             if stored.get((kind, frame), (None, None))[1] != content
         ]
+        checked = {content for _, content in stored.values()} | {None}
+        for kind, frame, *contents in self._database.rows(
+            "SELECT kind, frame, before, after FROM change_part"
+        ):
+            for content in {*contents} - checked:
+                try:
+                    unpack(content, CLASSES.get(kind, Never))
+                except Damaged as error:
+                    found.append(f"{_named(kind, frame)} in the history is damaged: {error}")
         return found
 
 

@@ -28,7 +28,7 @@ from labapp.media.identity import identify
 from labapp.media.survey import Survey, frame_checksum, survey
 from labapp.run.runner import select_frames
 from labapp.session.file.blobs import MAGIC, pack, unpack_from
-from labapp.session.file.database import Database
+from labapp.session.file.database import INTACT_SESSION, Database
 from labapp.session.file.read_cache import ReadCache
 from labapp.session.record import Recording
 from labapp.text import now
@@ -244,6 +244,26 @@ class Frames:
                 "the recording as it was at import",
             )
 
+    def refuse_changed(self) -> None:
+        """Raise if the frames' numbers or times have changed since the import.
+
+        Raises
+        ------
+        InputError
+            If they have, or there is no recording to compare them with: the file is damaged.
+        """
+        if changed := self._change(self.recording):
+            raise InputError(self._database.path, "frames", changed, INTACT_SESSION)
+
+    def _change(self, recording: Recording | None) -> str:
+        """Return how the frames differ from those of the import; empty if they do not."""
+        if recording is None:
+            content = self._database.value("SELECT max(coalesce(time_s, checksum)) FROM frame")
+            return "" if content is None else "there are frames, but no recording"
+        if recording.frames_sha256 == self._fingerprint():
+            return ""
+        return "the frames' numbers, times or checksums are not those of the import"
+
     @property
     def missing(self) -> Path | None:
         """Path at which the recording is missing; None if its frames can be read."""
@@ -294,12 +314,10 @@ class Frames:
             recording = self.recording
         except InputError as error:
             return [str(error)]
+        changed = self._change(recording)
+        found = [changed] if changed else []
         if recording is None:
-            content = self._database.value("SELECT max(coalesce(time_s, checksum)) FROM frame")
-            return [] if content is None else ["there are frames, but no recording"]
-        found = []
-        if recording.frames_sha256 != self._fingerprint():
-            found.append("the frames' numbers, times or checksums are not those of the import")
+            return found
         if not recording.embedded:
             try:
                 if identify(self._place()) != (recording.size, recording.sha256):

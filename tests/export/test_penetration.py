@@ -188,6 +188,8 @@ def changed(key: str, value: Any) -> Callable[[dict[str, Any]], object]:
         changed("step_s", True),
         changed("scale", ["1"] * 6),
         changed("scale", [True] * 6),
+        changed("low", [1e6] * 6),
+        changed("center", [[0.0], [0.0, 1.0]]),
     ],
 )
 def test_damaged_model_is_rejected(damage: Callable[[Any], object], tmp_path: Path) -> None:
@@ -215,6 +217,41 @@ def test_linear_model_with_wrong_weights_is_rejected(tmp_path: Path) -> None:
     content["static"]["weights"] = [1.0]
     (tmp_path / "model.json").write_text(json.dumps(content), "utf-8")
     with pytest.raises(InputError):
+        read_model(tmp_path / "model.json")
+
+
+@pytest.mark.parametrize("kind", ["arx", "gp"])
+@pytest.mark.parametrize("value", [None, "text", float("nan"), -1e15, [], [[1.0]], {}, "missing"])
+def test_error_names_the_damaged_field(kind: str, value: Any, tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    write_model(path, fitted(kind))
+    original = path.read_text("utf-8")
+    content = json.loads(original)
+    names = [*content, *(f"{part}.{key}" for part in ("orders", "static") for key in content[part])]
+    for name in set(names) - {"version"}:  # of the writing program, not used
+        damaged = json.loads(original)
+        *parts, key = name.split(".")
+        of = damaged[parts[0]] if parts else damaged
+        if value == "missing":
+            del of[key]
+        elif (name, value) in [("full_mm", None), ("target", "text")]:
+            continue
+        else:
+            of[key] = value
+        path.write_text(json.dumps(damaged), "utf-8")
+        with pytest.raises(InputError) as error:
+            read_model(path)
+        # An empty object has no fields: the first of them is missing.
+        assert error.value.field == name or error.value.field.startswith(f"{name}."), error.value
+        assert error.value.source == str(path)
+
+
+def test_linear_model_with_negative_variances_is_rejected(tmp_path: Path) -> None:
+    write_model(tmp_path / "model.json", fitted("arx"))
+    content = json.loads((tmp_path / "model.json").read_text("utf-8"))
+    content["static"]["covariance"] = (-np.array(content["static"]["covariance"])).tolist()
+    (tmp_path / "model.json").write_text(json.dumps(content), "utf-8")
+    with pytest.raises(InputError, match=r"static\.covariance"):
         read_model(tmp_path / "model.json")
 
 

@@ -11,6 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from labapp.core.calibration.boards import Board, BoardCorners
+from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.pipeline import Settings
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
@@ -31,6 +33,8 @@ def blob_of(tree: object) -> bytes:
     ("value", "hint", "fits"),
     [
         (1, float, True),
+        (10**30, float, False),
+        (-(10**30), int, False),
         (True, float, False),
         (1.0, int, False),
         (None, str | None, True),
@@ -86,6 +90,30 @@ def test_highly_compressed_blob_is_rejected():
         unpack(HEAD.pack(MAGIC, zlib.crc32(body)) + body)
 
 
+@pytest.mark.parametrize(
+    "marks",
+    [
+        ((0.0, float("inf"), 1.0, 1.0, 1.0),) * 5,
+        ((0.0, 0.0, 1e300, 1.0, 1.0),) * 5,
+        ((0.0, 0.0, 1.0, 1.0, 1.0),) * 3,
+    ],
+)
+def test_marks_that_determine_no_map_are_damaged(marks: Any):
+    points: Any = ((44.0, 590.0), (242.0, 588.0), 34.9, (43.0, 500.0), 15.9, (0.1, 0.1, 0.1), 90.0)
+    assert unpack(pack(PlaneCalibration(*points)))
+    with pytest.raises(Damaged):
+        unpack(pack(PlaneCalibration(*points, marks, "affine")))
+
+
+@pytest.mark.parametrize("factor", [np.nan, np.inf, 1e300, 0.0, (1.0, 0.0)])
+def test_corners_that_determine_no_map_are_damaged(factor: Any):
+    board = Board("a", "charuco", 9, 7, 10.0, "4X4_50", 0)
+    index = np.arange(len(board.corners_mm))
+    assert unpack(pack(BoardCorners(board, index, board.corners_mm * 8.0 + 50)))
+    with pytest.raises(Damaged):
+        unpack(pack(BoardCorners(board, index, (board.corners_mm * 8.0 + 50) * factor)))
+
+
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     np.save(tmp_path / "stack.npy", np.zeros((3, 20, 30), np.uint8))
@@ -119,6 +147,52 @@ def test_edited_columns_of_a_result_are_detected(path: Path, edit: str):
         assert len(session.problems()) == 1
 
 
+def edit(path: Path, statement: str) -> None:
+    """Edit a session as another program could, without its constraints."""
+    connection = sqlite3.connect(path, isolation_level=None)
+    connection.execute("PRAGMA ignore_check_constraints = ON")
+    connection.execute(statement)
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    "statement", ["UPDATE frame SET time_s = 7 WHERE number = 1", "DELETE FROM recording"]
+)
+def test_changed_times_are_not_exported(path: Path, statement: str):
+    edit(path, statement)
+    with Session.open(path, read_only=True) as session:
+        with pytest.raises(InputError, match="frames"):
+            session.export(path.with_name("out"))
+        with pytest.raises(InputError, match="frames"):
+            list(session.frame_results())
+    assert not path.with_name("out").exists()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    ["UPDATE result SET inputs = x''", "DELETE FROM detail", "UPDATE detail SET result = -result"],
+)
+def test_incomplete_result_is_damaged(path: Path, statement: str):
+    edit(path, statement)
+    with Session.open(path) as session:
+        for use in (
+            lambda: session.result(0, "fit"),
+            lambda: session.export(path.with_name("out")),
+        ):
+            with pytest.raises(InputError):
+                use()
+        # Damaged results have no part in the check of the set-up.
+        assert [found.status for _, found in session.measure([2])] == ["no-dots"]
+
+
+def test_name_of_a_scheme_that_is_no_text_is_damage(path: Path):
+    edit(path, "UPDATE result SET scheme = x'00ff'")
+    with Session.open(path) as session:
+        with pytest.raises(InputError, match="results"):
+            _ = session.measured_by
+        assert session.measure([2])
+
+
 def test_overview_works_with_damaged_inputs(path: Path):
     with Session.open(path) as session, session._database.transaction() as connection:
         connection.execute("UPDATE inputs SET settings = 'text' WHERE id = 1")
@@ -139,6 +213,7 @@ def test_undo_reports_a_damaged_history(path: Path):
         with pytest.raises(InputError, match="settings in the history"):
             session.undo()
         assert session.settings.scheme == "irs"
+        assert session.problems() != []
 
 
 def test_other_journal_mode_is_rejected_without_new_files(path: Path):

@@ -48,7 +48,10 @@ def check_fields(value: Any, shapes: Mapping[str, str]) -> None:
 
 
 def is_a(value: object, hint: Any) -> bool:
-    """Whether a value conforms to a type hint; integers count as ``float``."""
+    """Whether a value conforms to a type hint; integers count as ``float``.
+
+    An integer of more than 64 bits, which NumPy could not hold, conforms to none.
+    """
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return any(is_a(value, part) for part in parts)
@@ -60,7 +63,8 @@ def is_a(value: object, hint: Any) -> bool:
         return isinstance(value, origin) and _holds(value, parts)
     if hint in (int, float):
         allowed = (int, float) if hint is float else int
-        return isinstance(value, allowed) and not isinstance(value, bool)
+        is_long = isinstance(value, int) and abs(value) >= 1 << 63
+        return isinstance(value, allowed) and not (isinstance(value, bool) or is_long)
     if hint in (Any, Never):
         return hint is Any
     if hint is Surface:

@@ -51,6 +51,9 @@ from labapp.session.record import (
 )
 from labapp.session.signals import Signals
 
+LARGEST_PX = 1e6
+"""Limit of the coordinates of a calibration, px and mm."""
+
 
 @dataclass(frozen=True)
 class Stored:
@@ -108,7 +111,25 @@ def _spline_fits(value: Any) -> bool:
 
 
 def _corners_fit(value: Any) -> bool:
-    return _all_within(value.index, 0, len(value.board.corners_mm) - 1)
+    """Whether the corners are those of the board, and not on a line in the picture."""
+    return (
+        len(value.index) > 2
+        and _all_within(value.index, 0, len(value.board.corners_mm) - 1)
+        and _all_within(value.image_px, -LARGEST_PX, LARGEST_PX)
+        and all(
+            np.linalg.matrix_rank(places - places.mean(axis=0)) == 2
+            for places in (value.plane_mm, value.image_px)
+        )
+    )
+
+
+def _plane_fits(value: Any) -> bool:
+    """Whether the points and marks of a calibration determine a map."""
+    numbers = (*value.origin_px, *value.x_axis_px, *value.z_axis_px, *value.sigma_px)
+    lengths = (value.x_axis_mm, value.z_axis_mm, *(one for mark in value.marks for one in mark))
+    return _all_within(np.array([*numbers, *lengths]), -LARGEST_PX, LARGEST_PX) and bool(
+        np.isfinite(value.image_calibration.matrix).all()
+    )
 
 
 def _boards_fit(value: Any) -> bool:
@@ -138,7 +159,7 @@ def _line_correction_fits(value: Any) -> bool:
     return len(value.number) == len(lines) and all(len(one.image_px) > 1 for one in lines)
 
 
-def _all_within(numbers: Any, least: int, most: int) -> bool:
+def _all_within(numbers: Any, least: float, most: float) -> bool:
     return bool(((numbers >= least) & (numbers <= most)).all())
 
 
@@ -159,7 +180,7 @@ STORED = {
     "LaserReadings": Stored(LaserReadings),
     "LaserCalibration": Stored(LaserCalibration),
     "PlanePicture": Stored(PlanePicture),
-    "PlaneCalibration": Stored(PlaneCalibration),
+    "PlaneCalibration": Stored(PlaneCalibration, fits=_plane_fits),
     "BoardCalibration": Stored(BoardCalibration, fits=_boards_fit),
     "BoardCorners": Stored(
         BoardCorners, shapes={"index": "n", "image_px": "n 2"}, fits=_corners_fit

@@ -18,7 +18,7 @@ from labapp.core.schemes import SCHEMES
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.errors import InputError
 from labapp.session.file.blobs import Damaged, damage_as_input, fingerprint, pack, unpack
-from labapp.session.file.database import Database
+from labapp.session.file.database import INTACT_SESSION, Database
 from labapp.session.file.schema import MEASURES
 from labapp.session.results.setup_verdicts import SetupVerdicts, chosen_evenly
 from labapp.text import now
@@ -234,6 +234,11 @@ class StoredResults:
         """
         row = self._row(frame, scheme)
         if row is None:
+            if self._database.rows(
+                "SELECT 1 FROM result WHERE frame = ? AND scheme = ?", frame, scheme
+            ):
+                named = f"result of frame {frame}"
+                raise InputError(self._database.path, named, "incomplete", INTACT_SESSION)
             return None
         with damage_as_input(self._database.path, f"result of frame {frame}"):
             measurement = _verified(row.content, (frame, scheme, *row[:-1]))
@@ -278,7 +283,8 @@ class StoredResults:
         samples = []
         for frame in chosen_evenly([frame for frame, status in rows if status == "ok"]):
             row = self._row(frame, basis.scheme)
-            assert row is not None
+            if row is None:  # damaged
+                continue
             residuals = _residuals(row.content, (frame, basis.scheme, *row[:-1]))
             samples += [residuals] if residuals else []
         statuses = Counter(status for _, status in rows)
@@ -290,6 +296,8 @@ class StoredResults:
             "SELECT scheme, version, count(*) FROM result JOIN inputs ON inputs.id = result.inputs "
             "GROUP BY scheme, version ORDER BY scheme, version"
         )
+        if wrong := [name for row in rows for name in row[:2] if not isinstance(name, str)]:
+            raise InputError(self._database.path, "results", f"{wrong[0]!r}", INTACT_SESSION)
         return {(scheme, version): count for scheme, version, count in rows}
 
     def problems(self) -> list[str]:
