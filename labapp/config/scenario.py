@@ -33,6 +33,9 @@ A_SCENARIO = "a scenario (TOML, UTF-8)"
 
 OPTIONAL = ("torch", "camera", "look")
 
+SLOWEST_VIDEO_HZ, FASTEST_VIDEO_HZ = 0.01, 1000.0
+"""Frame rates that FFmpeg stores in an AVI file; beyond, it drops frames and changes the rate."""
+
 COURSE_HZ = (0.3, 3.0)
 """Range of the frequencies by which a pool's size fluctuates."""
 
@@ -191,6 +194,10 @@ def _recording(path: Path, values: dict[str, Any], rig: Rig) -> Recording:
     if form == "avi" and look.bits != 8:
         expected = '8 in a video; recording.format = "tif" or "png" holds more'
         raise InputError(path, "look.bits", look.bits, expected)
+    if form == "avi" and not SLOWEST_VIDEO_HZ <= rate <= FASTEST_VIDEO_HZ:
+        allowed = f"{SLOWEST_VIDEO_HZ:g} to {FASTEST_VIDEO_HZ:g} (Hz) in a video"
+        expected = f'{allowed}; recording.format = "tif" or "png" for other rates'
+        raise InputError(path, "recording.frame_rate_hz", rate, expected)
     frames = wanted["frames"]
     torches = (_torch(values["torch"]),) * frames if "torch" in values else ()
     times_s = np.arange(frames) / rate

@@ -10,7 +10,7 @@ import json
 import math
 import os
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from labapp.errors import InputError
 from labapp.export.features import needs_extra, weld_series
 from labapp.export.frame_result import FrameResult
 from labapp.files import as_bytes, read_limited, write_file
-from labapp.text import csv_text, number_cell
+from labapp.text import csv_text, number_cell, pluralize
 from labapp.version import VERSION
 
 FORMAT = 1
@@ -136,17 +136,29 @@ class _Fields:
         """Return an array of finite numbers above a limit."""
         numbers = f"{' × '.join(map(str, shape))} numbers above {above:g} and below {MOST:g}"
         values = self.get(key, Rule(numbers, lambda value: isinstance(value, list)))
-        try:
-            found = np.array(values)
-        except ValueError as error:  # rows of different lengths
-            raise self.error(key, error, numbers) from error
-        if found.shape != shape or found.dtype.kind not in "if":
-            kind = "numbers" if found.dtype.kind in "if" else "values"
-            raise self.error(key, f"{' × '.join(map(str, found.shape))} {kind}", numbers)
-        wrong = found[~((found > above) & (found < MOST))]
-        if len(wrong):
-            raise self.error(key, shown(wrong[0].item()), numbers)
-        return found.astype(float)
+        for place, wrong in _wrong(values, above, shape):
+            raise self.error(key + place, wrong, numbers)
+        return np.array(values, float)
+
+
+def _wrong(value: object, above: float, shape: tuple[int, ...]) -> Iterator[tuple[str, str]]:
+    """Yield place and value of items that are no numbers above a limit, or no lists of a shape.
+
+    Checked before NumPy sees them: a single long text would make an array of such texts.
+    """
+    if not shape:
+        if not (
+            isinstance(value, int | float) and not isinstance(value, bool) and above < value < MOST
+        ):
+            yield "", shown(value)
+    elif not isinstance(value, list):
+        yield "", shown(value)
+    elif len(value) != shape[0]:
+        yield "", pluralize(len(value), "value")
+    else:
+        for k, one in enumerate(value):
+            for place, wrong in _wrong(one, above, shape[1:]):
+                yield f"[{k}]{place}", wrong
 
 
 def _model(file: _Fields) -> PenetrationModel:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,9 @@ MESH_NODES = 250
 LARGEST_FILE = 1 << 29
 """Largest table or mesh, bytes."""
 
+MOST_NODES = 1 << 24
+"""Largest number of heights: a small file can claim any number, or name as many places."""
+
 SMALLEST_MM, LARGEST_MM = 0.5, 200.0
 """Limits of the longer side of a pool; other values indicate a wrong unit."""
 
@@ -36,6 +39,9 @@ PLY_TYPES = {
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
+
+DAMAGED = (ValueError, LookupError, EOFError, BadZipFile, OverflowError, MemoryError)
+"""Errors raised for damaged files."""
 
 Grid = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -93,6 +99,8 @@ def read_pool(
         if not SMALLEST_MM <= longest <= LARGEST_MM:
             expected = f"{SMALLEST_MM:g} to {LARGEST_MM:g} mm along its longer side"
             raise _Unreadable(f"{longest:g} mm long", expected)
+        if (np.abs(z) > LARGEST_MM).any():
+            raise _Unreadable("heights of metres", f"at most {LARGEST_MM:g} mm")
         outline = own_outline if outline_mm is None else np.asarray(outline_mm, float)
         shift = np.asarray(center_mm, float)
         outline = None if outline is None else outline + shift
@@ -101,7 +109,7 @@ def read_pool(
         raise InputError(path, "surface", error.what, error.expected) from error
     except OSError as error:
         raise InputError(path, "file", error.strerror or error, A_SURFACE) from error
-    except (ValueError, LookupError, EOFError, BadZipFile) as error:  # raised for damaged files
+    except DAMAGED as error:
         raise InputError(path, "surface", error, A_SURFACE) from error
 
 
@@ -109,7 +117,11 @@ def read_pool(
 
 
 def _npy(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
-    return _even(np.load(path, allow_pickle=False), spacing_mm), None
+    # Mapped, so that a claimed size beyond that of the file is an error, and takes no memory.
+    heights = np.load(path, mmap_mode="r", allow_pickle=False)
+    if heights.size > MOST_NODES:
+        raise _Unreadable(f"{heights.size} heights", f"at most {MOST_NODES}")
+    return _even(np.array(heights), spacing_mm), None
 
 
 def _even(heights: npt.NDArray[Any], spacing_mm: float | None) -> Grid:
@@ -126,11 +138,17 @@ def _even(heights: npt.NDArray[Any], spacing_mm: float | None) -> Grid:
 def _npz(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
     del spacing_mm
     # Opened here: numpy leaves a file open that begins like an archive but is not one.
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
-        lacking = {"x_mm", "y_mm", "z_mm"} - set(kept.files)
-        if lacking:
-            raise _Unreadable(f"no {', '.join(sorted(lacking))}", "x_mm, y_mm and z_mm")
-        x, y, z = (np.asarray(kept[name], float) for name in ("x_mm", "y_mm", "z_mm"))
+    with path.open("rb") as file:
+        with ZipFile(file) as archive:
+            unpacked = sum(part.file_size for part in archive.infolist())
+        if unpacked > LARGEST_FILE:
+            raise _Unreadable(f"{unpacked} bytes unpacked", f"at most {LARGEST_FILE}")
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as kept:
+            lacking = {"x_mm", "y_mm", "z_mm"} - set(kept.files)
+            if lacking:
+                raise _Unreadable(f"no {', '.join(sorted(lacking))}", "x_mm, y_mm and z_mm")
+            x, y, z = (np.asarray(kept[name], float) for name in ("x_mm", "y_mm", "z_mm"))
     if z.ndim != 2 or z.shape != (*y.shape, *x.shape):
         shapes = f"x_mm {x.shape}, y_mm {y.shape}, z_mm {z.shape}"
         raise _Unreadable(shapes, "shapes (n), (m) and (m, n)")
@@ -149,6 +167,9 @@ def _csv(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
     (x, column), (y, row) = (
         np.unique(np.round(nodes[:, n], 6), return_inverse=True) for n in range(2)
     )
+    if len(x) * len(y) > MOST_NODES:
+        found = f"{len(x)} values of x_mm and {len(y)} of y_mm"
+        raise _Unreadable(found, "those of the columns and rows of a grid")
     z = np.full((len(y), len(x)), np.nan)
     z[row, column] = nodes[:, 2]
     return (_rising(x, "x_mm"), _rising(y, "y_mm"), z), None
@@ -181,6 +202,8 @@ def _mesh(path: Path, spacing_mm: float | None) -> tuple[Grid, FloatArray]:
     del spacing_mm
     data = read_limited(path, LARGEST_FILE, A_SURFACE)
     corners = _stl(data) if path.suffix.lower() == ".stl" else _ply(data)
+    if not np.isfinite(corners).all():
+        raise _Unreadable("corners that are nan or infinite", "finite numbers")
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     up = normal[:, 2] > 0.05 * np.linalg.norm(normal, axis=1)
     if up.sum() < 16:
@@ -255,6 +278,8 @@ def _ply(data: bytes) -> FloatArray:
         raise _Unreadable("other properties", "faces with only a list of corners")
     names = [line[2] for line in plain]
     (_, vertices), (_, faces) = elements[:2]
+    if min(vertices, faces) < 1:
+        raise _Unreadable(f"{vertices} vertices, {faces} faces", "at least 1 of each")
     if order == "":
         table = body.split(b"\n")
         values = np.array([line.split() for line in table[:vertices]], float)
@@ -271,4 +296,6 @@ def _ply(data: bytes) -> FloatArray:
         triangles = np.column_stack([found_faces["count"], found_faces["at"]])
     if triangles.ndim != 2 or triangles.shape[1] != 4 or (triangles[:, 0] != 3).any():
         raise _Unreadable("faces that are not triangles", "PLY of triangles")
+    if triangles.min() < 0:  # would count from the end
+        raise _Unreadable(f"corner {triangles.min()}", "numbers of vertices, from 0")
     return np.asarray(places[triangles[:, 1:]])

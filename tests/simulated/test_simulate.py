@@ -5,12 +5,22 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from labapp.config.scenario import Scenario, read_scenario, shipped_scenarios
+from labapp.config.scenario import (
+    FASTEST_VIDEO_HZ,
+    SLOWEST_VIDEO_HZ,
+    Scenario,
+    find_scenario,
+    read_scenario,
+    shipped_scenarios,
+)
 from labapp.errors import InputError
+from labapp.media import open_source
 from labapp.session.session import Session
 from labapp.simulated.simulate import begin_session, simulate
+from labapp.simulation.recording import write_video
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +94,22 @@ def test_calibrated_bench_can_be_simulated(tmp_path: Path) -> None:
     assert calibrated in text
     (tmp_path / "own.toml").write_text(text, "utf-8")
     assert read_scenario(tmp_path / "own.toml").recording.view == read_scenario(path).recording.view
+
+
+@pytest.mark.parametrize("rate_hz", [1e-300, 1000.5, 2000.0])
+def test_frame_rate_that_a_video_cannot_store_is_rejected(tmp_path: Path, rate_hz: float) -> None:
+    text = find_scenario(Path("egg")).read_text("utf-8")
+    path = tmp_path / "own.toml"
+    path.write_text(text.replace("frame_rate_hz = 60.0", f"frame_rate_hz = {rate_hz}"), "utf-8")
+    with pytest.raises(InputError, match=r"recording\.frame_rate_hz"):
+        read_scenario(path)
+    path.write_text(path.read_text("utf-8") + '\nformat = "tif"\n', "utf-8")
+    assert read_scenario(path).recording.frame_rate_hz == rate_hz
+
+
+@pytest.mark.parametrize("rate_hz", [SLOWEST_VIDEO_HZ, FASTEST_VIDEO_HZ])
+def test_video_keeps_all_frames_and_its_rate(tmp_path: Path, rate_hz: float) -> None:
+    images = [np.full((48, 64), k, np.uint8) for k in range(20)]
+    write_video(tmp_path / "a.avi", images, rate_hz, (64, 48))
+    with open_source(tmp_path / "a.avi") as source:
+        assert (len(source), source.frame_rate_hz) == (20, pytest.approx(rate_hz))

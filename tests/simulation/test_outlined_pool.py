@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import io
 import pickle
+import tracemalloc
+import zipfile
 
 import meshio
 import numpy as np
@@ -253,6 +256,64 @@ def test_invalid_surface_files_are_rejected(tmp_path, name, content, words):
     with pytest.raises(InputError, match=words) as error:
         read_pool(path)
     assert error.value.source == str(path)
+
+
+def claim(shape):
+    """The bytes of a .npy file that claims a shape, and has ten numbers."""
+    file = io.BytesIO()
+    header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.getvalue() + bytes(80)
+
+
+def archive(**parts):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as made:
+        for name, content in parts.items():
+            made.writestr(f"{name}.npy", content)
+    return file.getvalue()
+
+
+def ply(corner, vertices=4):
+    head = f"element vertex {vertices}\nproperty float x\nproperty float y\nproperty float z\n"
+    faces = np.array([(3, (0, 1, 2)), (3, (0, 2, corner))], [("n", "<u1"), ("at", "<i4", 3)])
+    places = np.array([[0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0]], "<f4")
+    head += "element face 2\nproperty list uchar int at\nend_header\n"
+    start = b"ply\nformat binary_little_endian 1.0\n"
+    return start + head.encode() + places.tobytes() + faces.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.npy", claim((10**6, 10**6))),
+        ("a.npz", claim((10, 10))),
+        ("a.npz", archive(x_mm=bytes(1 << 28), y_mm=bytes(1 << 28), z_mm=b"x")),
+        ("a.csv", b"x_mm,y_mm,z_mm\n" + b"".join(b"%d,%d,0\n" % (k, k) for k in range(9000))),
+        ("a.npy", b"".join([claim((4, 4)), np.full(6, 1e300).tobytes()])),
+        ("a.ply", ply(-1)),
+        ("a.ply", ply(3, vertices=-1)),
+        ("a.ply", ply(3, vertices=10**30)),
+        ("a.stl", bytes(80) + (20).to_bytes(4, "little") + np.full(250, np.inf, "<f4").tobytes()),
+    ],
+)
+def test_sizes_and_numbers_of_surface_files_are_not_trusted(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError):
+            read_pool(tmp_path / name, 0.5)
+        assert tracemalloc.get_traced_memory()[1] < 600_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_archive_whose_arrays_are_shorter_than_claimed_is_rejected(tmp_path):
+    # The memory is reserved, but never used.
+    content = archive(x_mm=claim((10**12,)), y_mm=claim((10,)), z_mm=claim((10, 10)))
+    (tmp_path / "a.npz").write_bytes(content)
+    with pytest.raises(InputError):
+        read_pool(tmp_path / "a.npz")
 
 
 def test_missing_file_and_wrong_unit_are_rejected(tmp_path):
