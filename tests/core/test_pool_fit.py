@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -374,3 +375,15 @@ def test_uncertain_heights_count_less_for_the_level() -> None:
     (off, _), (off_weighed, stated_weighed) = np.transpose(exact), np.transpose(weighed)
     assert np.sqrt(np.mean(off_weighed**2)) < 0.7 * np.sqrt(np.mean(off**2))
     assert np.sqrt(np.mean((off_weighed / stated_weighed) ** 2)) < 1.2
+
+
+def test_rays_that_land_kilometres_apart_take_no_memory(match: Match) -> None:
+    """Labels that hardly fit with a likelier set-up took 15 GB for the knots of their splines."""
+    far = replace(OPEN_RIG, laser=replace(OPEN_RIG.laser, distance_mm=3e8))
+    tracemalloc.start()
+    try:
+        with pytest.raises(CannotMeasure, match="no-surface"):
+            fit_pool(match, far, FitSettings())
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()

@@ -270,7 +270,10 @@ def with_setup_free(
     gain = 0.0 if likeliest is observed else entered.cost - cost
     freed = evaluate_averaged(likeliest, labels, fit_settings, pool)
     marker_cost = freed.cost - freed.cost_without_marker if freed else 0.0
-    return FreeHypothesis(labels, cost=cost, observed=likeliest, gain=gain, marker_cost=marker_cost)
+    without_fits = replace(likeliest)  # those of many hypotheses would take gigabytes
+    return FreeHypothesis(
+        labels, cost=cost, observed=without_fits, gain=gain, marker_cost=marker_cost
+    )
 
 
 def _with_likeliest_setup(

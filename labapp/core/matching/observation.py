@@ -44,7 +44,7 @@ equal Gaussians have a single peak up to 2, and pixels and noise blur them furth
 KEPT_BYTES, COUNTED_EVERY = 100_000_000, 32
 """Approximate limit for the factors of the cached fits of a frame, bytes, beside which the rest of
 a fit is small. That is over a thousand fits of a usual pool. The size is checked once in so many
-fits."""
+fits, and whenever as many fits of the size of the new one would exceed it."""
 
 EDGE_MM, EDGE_PX = 0.5, 4.0
 """A dot nearer to the edge of the plane or of the frame may be cut off and does not count as in
@@ -171,7 +171,8 @@ class Observation(ReadOnlyArrays):
             near = None if initial is None else initial.surface
             try:
                 pool = fit_pool(matched, self.rig, settings, near)
-                if len(self._fitted) % COUNTED_EVERY == 0:
+                alike = pool.factor.nbytes * len(self._fitted)
+                if alike > KEPT_BYTES or len(self._fitted) % COUNTED_EVERY == 0:
                     self._forget_oldest()
                 self._fitted[key] = pool
             except CannotMeasure as failure:  # its traceback would keep the arrays of the fit alive

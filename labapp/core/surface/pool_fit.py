@@ -33,7 +33,7 @@ from labapp.core.surface.solver import (
     mean_splines,
     propagate_sigma,
 )
-from labapp.core.surface.spline import SplineBasis, SplineSurface, cell_products
+from labapp.core.surface.spline import DEGREE, SplineBasis, SplineSurface, cell_products
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 MARGIN_ROWS, LEAST_MARGIN_MM = 2.5, 2.0
@@ -163,10 +163,12 @@ def fit_pool(
     directions, points, is_outer = ray_kernels.rays_of_pairs(
         match.ray, rays.directions, rays.landing_mm
     )
-    basis = basis_around(points[:, :2], rays, settings.knot_mm)
-    if basis.count > MOST_SPLINES:
-        width, length = basis.high_mm - basis.low_mm
+    # Before the splines are made: labels that hardly fit may spread over kilometres.
+    size_mm = np.ptp(points[:, :2], axis=0) + 2 * _margin_mm(rays)
+    if not np.prod(np.ceil(size_mm / settings.knot_mm) + DEGREE) <= MOST_SPLINES:
+        width, length = size_mm
         raise CannotMeasure("no-surface", f"lit rays spread over {width:.0f} × {length:.0f} mm")
+    basis = basis_around(points[:, :2], rays, settings.knot_mm)
     equations = normal_equations(
         basis, rig, points, match.plane_mm, match.plane_covariance_mm2, settings
     )
