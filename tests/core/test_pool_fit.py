@@ -27,6 +27,7 @@ from labapp.core.surface.pool_fit import (
     FittedPool,
     basis_around,
     fit_pool,
+    misfits,
     normal_equations,
 )
 from labapp.core.surface.solver import Rounds
@@ -380,6 +381,11 @@ def test_uncertain_heights_count_less_for_the_level() -> None:
 def test_rays_that_land_kilometres_apart_take_no_memory(match: Match) -> None:
     """Labels that hardly fit with a likelier set-up took 15 GB for the knots of their splines."""
     far = replace(OPEN_RIG, laser=replace(OPEN_RIG.laser, distance_mm=3e8))
+    labels = np.full((1, OPEN_RIG.pattern.rows, OPEN_RIG.pattern.columns), -1)
+    labels[0][tuple(match.ray.T - 1)] = np.arange(len(match.ray))
+    dots = match.plane_mm, match.plane_covariance_mm2
+    assert misfits(labels, *dots, far, FitSettings(), least=6)[0] == np.inf
+    assert misfits(labels, *dots, OPEN_RIG, FitSettings(), least=6)[0] < 0.1
     tracemalloc.start()
     try:
         with pytest.raises(CannotMeasure, match="no-surface"):

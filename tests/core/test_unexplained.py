@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -118,6 +120,23 @@ def test_only_a_new_cheapest_hypothesis_is_repaired(grown: list[IntArray]) -> No
     repaired = with_repaired(observed, [], [lacking])
     assert grown
     assert repaired[-1].label_count == whole.label_count
+
+
+def test_fine_knots_are_not_tried_if_the_usual_ones_confirm_the_labels(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    observed, found = hypothesis(seen_with(false=0, missing=3))
+    assert found.missed_count > 0
+    knots: list[float | None] = []
+    grow = repair.grow_and_evaluate
+
+    def run(*labels: Any, knot_mm: float | None = None, **given: Any) -> Hypothesis | None:
+        knots.append(knot_mm)
+        return grow(*labels, knot_mm=knot_mm, **given)
+
+    monkeypatch.setattr(repair, "grow_and_evaluate", run)
+    with_repaired(observed, [], [found])
+    assert set(knots) == {None}
 
 
 def test_nothing_is_repaired_if_only_isolated_dots_are_left(grown: list[IntArray]) -> None:

@@ -84,7 +84,7 @@ def with_repaired(
 
 
 def _found_again(hypothesis: Hypothesis, grown: list[Hypothesis | None]) -> bool:
-    """Whether any of the grown hypotheses has the same labels as another."""
+    """Whether growth led to the labels of a hypothesis again."""
     return any(each is not None and (each.labels == hypothesis.labels).all() for each in grown)
 
 

@@ -81,7 +81,7 @@ def misfits(
             dot[n] = labelled[k, row[n], column[n]]
         own, points, outer = rays_of_pairs(pairs, directions, landing)
         grid = _grid_around(points, margin, knot)
-        if (grid[0, 3] + 3.0) * (grid[1, 3] + 3.0) > most_splines:
+        if not (grid[0, 3] + 3.0) * (grid[1, 3] + 3.0) <= most_splines:  # NaN, too
             continue
         on_plane = plane_mm[dot]
         dots = plane[0] + on_plane[:, :1] * plane[1] + on_plane[:, 1:] * plane[2]
