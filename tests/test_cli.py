@@ -238,14 +238,17 @@ def test_unwritable_output_folder_is_rejected(labapp: Run, folder: Path, tmp_pat
 
 
 @pytest.mark.parametrize("empty", ["SOURCE", "--out"])
-def test_empty_path_is_not_the_current_folder(labapp: Run, folder: Path, empty: str) -> None:
+def test_empty_path_is_not_the_current_folder(
+    labapp: Run, folder: Path, tmp_path: Path, empty: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     given = {"SOURCE": folder, "--out": folder / "out"} | {empty: ""}
     code, _, stderr = labapp(
         "reconstruct", given["SOURCE"], "--setup", SETUP, "--out", given["--out"]
     )
     assert code == 2
     assert empty in stderr
-    assert not Path("run.json").exists()
+    assert not (tmp_path / "run.json").exists()
 
 
 def test_full_disk_leaves_complete_frames(
