@@ -8,7 +8,9 @@ import numpy as np
 
 from labapp.config import bench_check
 from labapp.config.toml_keys import (
+    LARGEST,
     LARGEST_MM,
+    SMALLEST,
     Rule,
     are_numbers,
     between,
@@ -60,15 +62,14 @@ def _are_measured(value: object) -> bool:
 _PIXEL = Rule("[u, v], two numbers (px)", lambda value: are_numbers(value, 2))
 _ON_AXIS = Rule(
     f"a number from -{LARGEST_MM:g} to {LARGEST_MM:g} (mm) that is not 0",
-    lambda value: is_number(value) and 0 < abs(value) <= LARGEST_MM,
+    lambda value: is_number(value) and SMALLEST < abs(value) <= LARGEST_MM,
 )
 
 
-def _two_numbers(expected: str, above_zero: bool = False) -> Rule:
-    def accepts(value: object) -> bool:
-        return are_numbers(value, 2) and (min(value) > 0 or not above_zero)
-
-    return Rule(expected, accepts, required=False)
+def _two_numbers(expected: str, least: float = -LARGEST) -> Rule:
+    return Rule(
+        expected, lambda value: are_numbers(value, 2) and min(value) >= least, required=False
+    )
 
 
 THREE_POINTS = {
@@ -173,7 +174,7 @@ SECTIONS = {
     },
     "image_calibration": {**THREE_POINTS, **HOMOGRAPHY, **_OF_PICTURE},
     "camera_lens": {
-        "focal_px": _two_numbers("[fu, fv], two numbers above 0 (px)", above_zero=True),
+        "focal_px": _two_numbers("[fu, fv], two numbers from 1 (px)", least=1.0),
         "center_px": _two_numbers("[u, v], two numbers (px)"),
         "distortion": Rule(
             "[k1, k2, p1, p2, k3], five numbers as OpenCV has them",

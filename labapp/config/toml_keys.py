@@ -25,6 +25,9 @@ LARGEST_TEXT = 1 << 24
 LARGEST = 1e9
 """Upper limit of numbers of any kind."""
 
+SMALLEST = 1e-6
+"""Lower limit of numbers that must be above 0."""
+
 
 def read_text(path: Path, wanted: str) -> str:
     """Read a UTF-8 text file; ``wanted`` is the expected content, for the error.
@@ -115,7 +118,7 @@ def between(low: float, high: float, unit: str, required: bool = True) -> Rule:
     """A number above ``low`` and below ``high``."""
     return Rule(
         f"a number above {low:g} and below {high:g} ({unit})",
-        lambda value: is_number(value) and low < value < high,
+        lambda value: is_number(value) and (low or SMALLEST) < value < high,
         required,
     )
 

@@ -128,6 +128,8 @@ def test_homography_replaces_the_three_points(path: Path) -> None:
         ("distance_mm = 31.48", "distance_mm = true", "laser.distance_mm: true; expected a number"),
         ("distance_mm = 31.48", "distance_mm = '31'", 'laser.distance_mm: "31"; expected a number'),
         ("distance_mm = 31.48", f"distance_mm = 1{'0' * 400}", "expected a number above 0 and bel"),
+        ("distance_mm = 31.48", "distance_mm = 1e-300", "laser.distance_mm: 1e-300; expected"),
+        ("x_axis_mm = 69.85", "x_axis_mm = 1e-300", "x_axis_mm: 1e-300; .* not 0"),
         ("distance_mm = 31.48\n", "", "laser.distance_mm: missing; expected a number above 0"),
         (
             "distance_mm = 31.48",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from labapp.config.line_setup import read_line_setup
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import line_directions
 from labapp.core.geometry.optics import intersect_level
 from labapp.core.lines.frame import measure_lines
@@ -74,3 +75,9 @@ def test_too_few_lines_give_no_edges(bench):
     look, rng = LineLook(metal=0.4), np.random.default_rng(3)
     image = render_lines(HOLLOW, rig, VIEW, look, rng).image
     assert pool_edges(image, rig, bench.calibration) is None
+
+
+def test_lines_much_farther_apart_than_the_picture_give_no_edges(bench):
+    image = np.full((640, 480), 9.0)
+    far = ImageCalibration.from_three_points((2.0, 638.0), (452.0, 638.0), 60.0, (2.0, 188.0), 1e-6)
+    assert pool_edges(image, bench.line_rig, far) is None

@@ -97,8 +97,8 @@ def pool_edges(image: Image, rig: LineRig, calibration: ImageCalibration) -> Poo
     fan = np.linspace(-rig.pattern.half_fan, rig.pattern.half_fan, FAN_STEPS)
     number = np.arange(1.0 - FRINGES, rig.pattern.count + 1 + FRINGES)
     point, path = _straight_lines(rig, calibration, number, fan)
-    if not np.isfinite(path).all():
-        return None
+    if not np.isfinite(path).all() or np.ptp(path, axis=0).max() > sum(image.shape):
+        return None  # at no place are all lines in the picture
     picture = np.ascontiguousarray(image, np.float32)
     light, noise, width = _light_along(picture, path)
     own = slice(FRINGES, -FRINGES)
