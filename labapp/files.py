@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -75,6 +77,25 @@ def write_all(file: io.FileIO, content: bytes) -> None:
         content = content[file.write(content) :]
 
 
+def regular_size(path: Path) -> int:
+    """Return the size of a regular file, bytes; devices and pipes would block.
+
+    Raises
+    ------
+    OSError
+        If it is not regular, or does not exist.
+    """
+    try:
+        found = path.stat()
+    except ValueError as error:  # a NUL byte in the name
+        raise OSError(errno.EINVAL, str(error)) from error
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(errno.EISDIR, "is a folder")
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "a device or a pipe, not a file")
+    return found.st_size
+
+
 def read_limited(path: Path, largest: int, wanted: str) -> bytes:
     """Read a file of at most ``largest`` bytes; a device or a pipe cannot fill the memory.
 
@@ -88,6 +109,8 @@ def read_limited(path: Path, largest: int, wanted: str) -> bytes:
     InputError
         If it cannot be read or is larger.
     """
+    if Path(os.path.realpath(path)).is_fifo():  # not /dev/stdin or /dev/fd/N, which have a writer
+        raise InputError(path, "file", "a named pipe", wanted)
     with os_errors_as_input(path, "file", wanted), path.open("rb") as file:
         content = file.read(largest + 1)
     if len(content) > largest:

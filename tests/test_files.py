@@ -68,6 +68,20 @@ def test_pipe_is_written_to_and_not_replaced(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [pipe]
 
 
+@pytest.mark.skipif(IS_WINDOWS, reason="no pipes in folders")
+def test_only_pipes_with_a_writer_are_read(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="named pipe"):
+        read_limited(tmp_path / "pipe", 10, "text")
+    reader, writer = os.pipe()
+    os.write(writer, b"text")
+    os.close(writer)
+    try:
+        assert read_limited(Path(f"/dev/fd/{reader}"), 10, "text") == b"text"
+    finally:
+        os.close(reader)
+
+
 def test_folder_is_not_replaced(tmp_path: Path):
     with pytest.raises((IsADirectoryError, PermissionError)):  # the latter on Windows
         write_atomically(tmp_path, b"rows")

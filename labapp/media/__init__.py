@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 
 from labapp.errors import InputError, os_errors_as_input
+from labapp.files import regular_size
 from labapp.media.base import Frame, FrameSource, GreyImage
 from labapp.media.formats.cine import CINE_MAGIC, CineSource
 from labapp.media.formats.images import IMAGE_SUFFIXES, ImageSequence, files_in, images_in
 from labapp.media.formats.numpy_stack import NPY_MAGIC, ZIP_MAGIC, NumpyStack
 from labapp.media.formats.photron import PHOTRON_SUFFIXES, PhotronSource
-from labapp.media.formats.stored import regular_size
 from labapp.media.formats.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 from labapp.media.quiet import quiet_opencv
 

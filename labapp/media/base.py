@@ -106,7 +106,8 @@ def to_grey(image: npt.NDArray[Any]) -> GreyImage:
         converted to float32.
     """
     if image.dtype not in (np.uint8, np.uint16):
-        image = image.astype(np.float32)
+        with np.errstate(over="ignore"):  # infinite levels are an error of each reader
+            image = image.astype(np.float32)
     if image.ndim == 2:
         return image
     if image.shape[2] < 3:

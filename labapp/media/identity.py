@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 
 from labapp.errors import os_errors_as_input
-from labapp.media.formats.stored import regular_size
+from labapp.files import regular_size
 
 READ_BYTES = 1 << 20
 PAIRED = frozenset({".cih", ".cihx", ".mraw"})

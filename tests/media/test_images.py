@@ -14,7 +14,7 @@ import tifffile
 from labapp.errors import InputError
 from labapp.media import open_source
 from labapp.media.base import to_grey
-from labapp.media.formats.images import natural_key
+from labapp.media.formats.images import natural_key, read_image
 from tests.media.cine_writer import write_cine
 from tests.media.conftest import WriteVideo
 from tests.scripts import peak_mb, run_python
@@ -286,6 +286,15 @@ def test_source_must_be_a_regular_file(tmp_path: Path, name: str) -> None:
             print(error.problems[0].expected)
     """
     assert run_python(script).strip()
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.bmp"])
+def test_picture_of_gigabytes_is_not_read(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(b"BM")
+    os.truncate(path, 2**40)
+    with pytest.raises(InputError, match=f"size: {2**40} bytes"):
+        read_image(path)
 
 
 def test_invalid_source_is_rejected(tmp_path: Path) -> None:

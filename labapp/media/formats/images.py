@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.errors import InputError, os_errors_as_input
+from labapp.files import regular_size
 from labapp.media.base import GreyImage, to_grey
 from labapp.media.formats.stored import (
     StoredFrames,
     check_shape,
     finite,
     first_readable,
-    regular_size,
 )
 from labapp.media.formats.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 from labapp.pixels import MOST_PIXELS
@@ -27,6 +27,9 @@ IMAGE_SUFFIXES = frozenset(
     ".png .bmp .jpg .jpeg .jp2 .webp .pgm .ppm .pbm .pnm .pfm .exr".split()
 ) | set(TIFF_SUFFIXES)
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+LARGEST_FILE = 8 * MOST_PIXELS
+"""Largest image file, bytes: four samples of 16 bit per pixel."""
+
 AN_IMAGE = f"a complete image of at most {MOST_PIXELS} px: PNG, TIFF, BMP, JPEG, PGM"
 
 
@@ -79,8 +82,10 @@ def read_image(path: Path) -> GreyImage:
     """
     # Not read by OpenCV, for specific errors.
     with os_errors_as_input(path, "file", "a file that may be read"):
-        regular_size(path)
-        content = path.read_bytes()
+        size = regular_size(path)
+        content = path.read_bytes() if size <= LARGEST_FILE else b""
+    if size > LARGEST_FILE:
+        raise InputError(path, "size", f"{size} bytes", f"at most {LARGEST_FILE} bytes: {AN_IMAGE}")
     if not content:
         raise InputError(path, "size", "0 bytes", AN_IMAGE)
     if content[:4] in TIFF_MAGICS:

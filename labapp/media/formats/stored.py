@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import math
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,6 +12,7 @@ import numpy.typing as npt
 
 from labapp.core.values import FloatArray
 from labapp.errors import InputError, os_errors_as_input
+from labapp.files import regular_size
 from labapp.media.base import Frame, FrameSource, GreyImage, check_index, format_frame_rate
 from labapp.pixels import MOST_PIXELS
 
@@ -148,25 +147,6 @@ def finite(path: Path, image: GreyImage) -> GreyImage:
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         raise InputError(path, "grey levels", "NaN or infinity", "finite grey levels")
     return image
-
-
-def regular_size(path: Path) -> int:
-    """Return the size of a regular file, bytes; devices and pipes would block.
-
-    Raises
-    ------
-    OSError
-        If it is not regular, or does not exist.
-    """
-    try:
-        found = path.stat()
-    except ValueError as error:  # a NUL byte in the name
-        raise OSError(errno.EINVAL, str(error)) from error
-    if stat.S_ISDIR(found.st_mode):
-        raise IsADirectoryError(errno.EISDIR, "is a folder")
-    if not stat.S_ISREG(found.st_mode):
-        raise OSError(errno.EINVAL, "a device or a pipe, not a file")
-    return found.st_size
 
 
 def file_size(path: Path) -> int:

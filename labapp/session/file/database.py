@@ -23,7 +23,7 @@ import numpy.typing as npt
 from filelock import FileLock, Timeout
 
 from labapp.errors import PATH, InputError, os_errors_as_input, require
-from labapp.files import atomic_file
+from labapp.files import atomic_file, regular_size
 from labapp.session.file.schema import APPLICATION_ID, MIGRATIONS, TABLES, VERSION
 
 SUFFIX = ".labsession"
@@ -265,8 +265,6 @@ def new_session_path(path: str | os.PathLike[str]) -> Path:
 
 def _check_header(path: Path) -> int:
     """Return the version of a session file, read without SQLite for more specific errors."""
-    from labapp.media.formats.stored import regular_size  # late import: it is slow
-
     with os_errors_as_input(path, "file", A_SESSION):
         regular_size(path)
         with path.open("rb") as file:
