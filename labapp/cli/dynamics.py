@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,6 +15,8 @@ from labapp.files import write_file
 if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics, DynamicsSettings
     from labapp.session.signals import Signals
+
+LARGEST_HZ = 1e9
 
 Segment = Annotated[
     float | None,
@@ -128,8 +129,9 @@ def _band(text: str | None) -> tuple[float, float] | None:
         low, high = map(float, text.split(":"))
     except ValueError:
         low = high = 0.0
-    if not 0 < low < high < math.inf:
-        raise InputError("--band", "band", text, "LOW:HIGH, two frequencies above 0 (Hz)")
+    if not 0 < low < high <= LARGEST_HZ:
+        right = f"LOW:HIGH, two frequencies above 0, up to {LARGEST_HZ:g} (Hz)"
+        raise InputError("--band", "band", text, right)
     return low, high
 
 

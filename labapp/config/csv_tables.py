@@ -15,6 +15,7 @@ import numpy as np
 
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
+from labapp.files import regular_size
 
 LONGEST_LINE = 1 << 14
 HEAD_BYTES = 1 << 16
@@ -40,7 +41,7 @@ def open_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
         If the file cannot be read, is too large, or is not text.
     """
     try:
-        size = path.stat().st_size
+        size = regular_size(path)
         if size > largest:
             raise InputError(path, "size", f"{size} bytes", f"at most {largest} bytes")
         with path.open("rb") as head:
@@ -49,7 +50,7 @@ def open_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
         with path.open(encoding="utf-8-sig", newline="") as file:
             yield file
     except OSError as error:
-        raise InputError(path, "file", error.strerror, wanted) from error
+        raise InputError(path, "file", error.strerror or error, wanted) from error
     except UnicodeDecodeError as error:
         raise InputError(path, "encoding", "not UTF-8", wanted) from error
     except csv.Error as error:
@@ -77,6 +78,29 @@ def parse_number(cell: str, separator: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
+
+
+class NumberCells:
+    """Parser of a table's numbers, which all have the same decimal sign.
+
+    The other sign separates thousands, or the number comes from elsewhere: it is no number then.
+    """
+
+    def __init__(self, separator: str) -> None:
+        self._separator, self._signs = separator, set[str]()
+
+    def parse(self, cell: str) -> float | None:
+        """Parse a cell by `parse_number`; None, too, if it has the other decimal sign."""
+        signs = self._signs.union(sign for sign in ".," if sign in cell)
+        value = parse_number(cell, self._separator) if len(signs) < 2 else None
+        self._signs = self._signs if value is None else signs
+        return value
+
+    @property
+    def expected(self) -> str:
+        """A valid cell, for errors."""
+        sign = "".join(self._signs)
+        return f"a number, its decimal sign {sign} as above" if sign else "a number"
 
 
 def read_columns(
@@ -107,6 +131,7 @@ def read_columns(
             )
         texts: dict[str, list[str]] = {name: [] for name in names if name in words}
         numbers = {name: array("d") for name in names if name not in words}
+        number = NumberCells(separator)
         for line, cells in enumerate(csv.reader(lines, delimiter=separator), 2):
             if not any(cells):
                 continue
@@ -116,8 +141,8 @@ def read_columns(
                 if name in texts:
                     texts[name].append(cell)
                     continue
-                value = parse_number(cell, separator) if cell else math.nan
+                value = number.parse(cell) if cell else math.nan
                 if value is None:
-                    raise InputError(path, f"line {line}, {name}", cell, "a number")
+                    raise InputError(path, f"line {line}, {name}", cell, number.expected)
                 numbers[name].append(value)
     return {name: texts[name] if name in texts else np.array(numbers[name]) for name in names}

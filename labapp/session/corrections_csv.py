@@ -20,9 +20,9 @@ import scipy
 
 from labapp.config.csv_tables import (
     PROBLEMS_SHOWN,
+    NumberCells,
     bounded_lines,
     open_table,
-    parse_number,
 )
 from labapp.core.images.dots import Dots
 from labapp.core.rows.correction import MOST, PLACED_PX, Correction, set_reference
@@ -168,6 +168,7 @@ class _Reader:
         bounded = bounded_lines(path, file, A_TABLE)
         head = next(bounded, "")
         self._separator = max(",;\t", key=head.count)
+        self._number = NumberCells(self._separator)
         self._reader = csv.reader(itertools.chain([head], bounded), delimiter=self._separator)
         self._names = [name.strip() for name in next(self._reader, [])]
         self.has_frames = "frame" in self._names
@@ -224,7 +225,7 @@ class _Reader:
         return _Row(line, u, v, row, column, blocked)
 
     def _place(self, line: int, name: str, cells: dict[str, str]) -> float | None:
-        value = parse_number(cells[name], self._separator)
+        value = self._number.parse(cells[name])
         if value is None or not -0.5 <= value <= self._bounds[name]:
             inside = f"a number from -0.5 to {self._bounds[name]:g} (px, within the frame)"
             self._refuse(line, name, cells[name], inside)
@@ -234,7 +235,7 @@ class _Reader:
     def _integer(
         self, line: int, name: str, cells: dict[str, str], least: int, expected: str
     ) -> int | None:
-        value = parse_number(cells[name], self._separator)
+        value = self._number.parse(cells[name])
         most = MOST if least else math.inf
         if value is None or value != math.floor(value) or not least <= value <= most:
             self._refuse(line, name, cells[name], expected)

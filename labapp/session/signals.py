@@ -19,12 +19,13 @@ import numpy as np
 
 from labapp.config.csv_tables import (
     PROBLEMS_SHOWN,
+    NumberCells,
     bounded_lines,
     open_table,
-    parse_number,
 )
 from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.errors import InputError
+from labapp.files import regular_size
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.alignment import Offset
@@ -39,6 +40,8 @@ A_WAV = "WAV (PCM of 8, 16 or 32 bits, or floats): current, voltage, wire feed, 
 
 LARGEST_FILE = 1 << 28
 MOST_ROWS = 500_000
+LARGEST = 1e12
+"""Upper limit of times and samples; a time may be counted from 1904."""
 LINES_ABOVE = 60
 """Most lines up to the header line; loggers write information above it."""
 
@@ -164,16 +167,27 @@ def read_signals(
     if suffix in (".tdms", ".wav"):
         wanted = A_TDMS if suffix == ".tdms" else A_WAV
         with _hostile(path, wanted):
-            return _read_tdms(path) if suffix == ".tdms" else _read_wav(path, full_scale)
-    with open_table(path, A_TABLE, LARGEST_FILE) as file:
-        return _read(path, file)
+            found = _read_tdms(path) if suffix == ".tdms" else _read_wav(path, full_scale)
+    else:
+        with open_table(path, A_TABLE, LARGEST_FILE) as file:
+            found = _read(path, file)
+    if not found.channels:
+        named = ", ".join(CHANNELS)
+        raise InputError(path, named, "no numbers", "numbers in one of the channels")
+    for name, values in {"time": found.time_s, **found.channels}.items():
+        largest = float(np.nanmax(np.abs(values)))
+        if largest > LARGEST:
+            raise InputError(
+                path, name, f"{largest:g}", f"numbers from {-LARGEST:g} to {LARGEST:g}"
+            )
+    return found
 
 
 @contextmanager
 def _hostile(path: Path, wanted: str) -> Iterator[None]:
     """Check the size of an untrusted binary file, and convert all errors to `InputError`."""
     try:
-        size = path.stat().st_size
+        size = regular_size(path)
         if size > LARGEST_FILE:
             raise InputError(path, "size", f"{size} bytes", f"at most {LARGEST_FILE} bytes")
         with warnings.catch_warnings():
@@ -197,13 +211,16 @@ def _read_tdms(path: Path) -> Signals:
     time_s: FloatArray | None = None
     with path.open("rb") as raw, TdmsFile.open(raw) as file:
         for channel in (channel for group in file.groups() for channel in group.channels()):
-            unit = channel.properties.get("unit_string") or None
+            unit = str(channel.properties.get("unit_string") or "") or None
             named = _named(channel.name, 0, unit)
             if not named and unit and (other := _named(channel.name, 0)):
                 right = f"one of {', '.join(UNITS[other[0].quantity])}"
                 raise InputError(path, f"unit of {channel.name}", unit, right)
-            if not named or named[0].quantity in found:
+            if not named:
                 continue
+            if named[0].quantity in found:
+                right = f"one channel for {named[0].quantity}"
+                raise InputError(path, "channels", f"{channel.name}, another one", right)
             bytes_held = len(channel) * max(getattr(channel.dtype, "itemsize", 8), 1)
             if bytes_held > path.stat().st_size or channel.dtype.kind not in "iuf":
                 shown = f"{len(channel)} samples of {channel.dtype}"
@@ -220,6 +237,8 @@ def _read_wav(path: Path, full_scale: Sequence[float]) -> Signals:
     from scipy.io import wavfile
 
     rate, data = wavfile.read(path, mmap=True)
+    if not all(math.isfinite(scale) and scale for scale in full_scale):
+        raise InputError(path, "full scale", full_scale, "finite numbers that are not 0")
     data = data.reshape(len(data), -1)[:, : len(CHANNELS)]
     if data.dtype.kind == "f":
         offset, scale = 0.0, 1.0
@@ -266,7 +285,7 @@ def _read(path: Path, file: TextIO) -> Signals:
     problems: list[InputError] = []
     held = {column.quantity: array("d") for column in columns}
     last, last_line = -math.inf, 0
-    reader = csv.reader(lines, delimiter=separator)
+    reader, number = csv.reader(lines, delimiter=separator), NumberCells(separator)
     for cells in reader:
         line = above + reader.line_num
         if not any(map(str.strip, cells)):
@@ -276,7 +295,7 @@ def _read(path: Path, file: TextIO) -> Signals:
             wanted = f"{width}, as in the line of names{hint}"
             problems.append(InputError(path, f"line {line}, cells", len(cells), wanted))
         else:
-            time_s = _take(path, line, cells, columns, separator, held, problems)
+            time_s = _take(path, line, cells, columns, number, held, problems)
             if time_s is not None and time_s <= last:
                 wanted = f"a time after that of line {last_line}"
                 cell = cells[columns[0].place].strip()
@@ -341,7 +360,7 @@ def _take(
     line: int,
     cells: list[str],
     columns: list[_Column],
-    separator: str,
+    number: NumberCells,
     held: dict[str, array[float]],
     problems: list[InputError],
 ) -> float | None:
@@ -349,13 +368,13 @@ def _take(
     time_s = None
     for column in columns:
         cell = cells[column.place].strip()
-        value = parse_number(cell, separator)
+        value = number.parse(cell)
         if column.quantity == "time":
             time_s = None if value is None else value * column.factor
         elif not cell:
             value = math.nan
         if value is None:
-            wanted = "a number" if column.quantity == "time" else "a number, or nothing"
+            wanted = number.expected + ", or nothing" * (column.quantity != "time")
             shown = cell or "nothing"
             problems.append(InputError(path, f"line {line}, {column.name}", shown, wanted))
             value = math.nan

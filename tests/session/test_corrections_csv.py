@@ -167,7 +167,7 @@ def test_huge_files_are_rejected(tmp_path: Path, before: Correction) -> None:
 
 
 def test_folder_is_rejected(tmp_path: Path, before: Correction) -> None:
-    with pytest.raises(InputError, match="file: Is a directory"):
+    with pytest.raises(InputError, match="file: is a folder"):
         read_correction(tmp_path, 0, SHAPE, before)
 
 

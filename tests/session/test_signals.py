@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from labapp.errors import InputError
 from labapp.session.session import Session
 from labapp.session.signals import MOST_ROWS, Signals, read_signals
+from labapp.system import IS_WINDOWS
 
 
 @pytest.fixture
@@ -55,6 +57,11 @@ def test_table_may_have_only_a_current(table) -> None:
         ("time,current\n0,1\ninf,2\n", "line 3, time", "inf"),
         ("about\n\ntime,current\n1,1\n1,2\n", "line 5, time", "1"),
         ("time,current\n0,1\n0.5,1,5\n", "line 3, cells", "3"),
+        ("time;current\n0.5;1\n1;1,234\n", "line 3, current", "1,234"),
+        ("time;current\n0,5;1\n1.000;2\n", "line 3, time", "1.000"),
+        ("time,current\n0,\n1,\n", "current, voltage, wire", "no numbers"),
+        ("time,current\n0,1e300\n1,\n", "current", "1e+300"),
+        ("time,current\n0,1\n1e300,1\n", "time", "1e+300"),
         ("time,current,current_a\n0,1,1\n", "line 1, names", "current twice"),
         ("time,gas\n0,1\n", "columns", "time,gas"),
         ("current,voltage\n0,1\n", "columns", "current,voltage"),
@@ -155,6 +162,30 @@ def test_wav_is_scaled_and_averaged_to_the_limit_of_rows(tmp_path: Path, monkeyp
     signals = read_signals(path, (200.0, 50.0, 1.0))
     np.testing.assert_allclose(signals.current_a, 50)
     np.testing.assert_allclose(signals.time_s, [0.0015, 0.0055, 0.0095, 0.0135])
+
+
+def test_tdms_with_two_channels_of_a_quantity_is_rejected(tmp_path: Path) -> None:
+    wave = {"wf_increment": 0.001}
+    channels = [("current", np.ones(3), wave), ("Current (A)", np.zeros(3), wave)]
+    with pytest.raises(InputError, match=r"channels: Current \(A\), another one"):
+        read_signals(write_tdms(tmp_path / "a.tdms", channels))
+
+
+@pytest.mark.parametrize("scale", [0.0, np.nan])
+def test_full_scale_must_be_a_number(tmp_path: Path, scale: float) -> None:
+    from scipy.io import wavfile
+
+    wavfile.write(tmp_path / "a.wav", 1000, np.ones((9, 2), np.int16))
+    with pytest.raises(InputError, match="full scale"):
+        read_signals(tmp_path / "a.wav", (1.0, scale, 1.0))
+
+
+@pytest.mark.skipif(IS_WINDOWS, reason="no pipes in folders")
+@pytest.mark.parametrize("name", ["a.csv", "a.tdms", "a.wav"])
+def test_pipe_is_rejected_instead_of_waiting_for_it(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match="pipe"):
+        read_signals(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["a.tdms", "a.wav"])
