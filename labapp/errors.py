@@ -9,6 +9,8 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+from labapp.text import printable
+
 MAX_SHOWN = 80
 """Most characters of an invalid value that a message shows."""
 
@@ -49,7 +51,8 @@ class InputError(Exception):
         shown = str(self.value)
         if len(shown) > MAX_SHOWN:
             shown = shown[: MAX_SHOWN - 1] + "…"
-        first = f"{self.source}: {self.field}: {shown}; expected {self.expected}"
+        where = printable(f"{self.source}: {self.field}: {shown}")
+        first = f"{where}; expected {self.expected}"
         return "\n".join([first, *map(str, self.others)])
 
     @property

@@ -23,3 +23,8 @@ def test_long_value_is_shortened() -> None:
 def test_error_can_be_pickled() -> None:
     error = InputError("a", "b", "c", "d")
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_control_characters_are_not_sent_to_the_terminal() -> None:
+    error = InputError("a\x1b[2J.toml", "laser", "1\n\x07", "a number")
+    assert str(error) == "a\\x1b[2J.toml: laser: 1\\n\\x07; expected a number"

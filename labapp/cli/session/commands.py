@@ -46,7 +46,7 @@ from labapp.core.schemes import scheme_words
 from labapp.errors import InputError
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS
 from labapp.session.results.statuses import is_measured
-from labapp.text import local_time, now, pluralize
+from labapp.text import local_time, now, pluralize, printable
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings
@@ -456,7 +456,7 @@ def verify(
         with _counted("checking") as progress:
             problems = session.problems(progress, recording)
         for problem in problems:
-            typer.echo(problem)
+            typer.echo(printable(problem))
         if problems:
             typer.echo(
                 f"What helps\n  a missing recording: {command('relink', file)} RECORDING\n"

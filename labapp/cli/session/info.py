@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from labapp.cli.shared import SessionFile, frames_text
-from labapp.text import pluralize
+from labapp.text import pluralize, printable
 
 if TYPE_CHECKING:
     from labapp.session.session import Session
@@ -126,7 +126,7 @@ def _text(facts: dict[str, Any]) -> list[str]:
         ("", f"{c['made']}  {c['label']}{' (undone)' * c['undone']}")
         for c in facts.get("history", ())
     ]
-    return [f"{name:11}{text}" for name, text in lines]
+    return [printable(f"{name:11}{text}") for name, text in lines]
 
 
 def _setup_lines(lacks: list[str]) -> list[tuple[str, str]]:
