@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -46,12 +47,23 @@ class CalibrationPictures:
             raise InputError(path, "calibration picture", value, "what was kept there")
         return np.asarray(image)
 
-    def problems(self) -> list[str]:
-        """Return sentences about damaged pictures; empty if there are none."""
+    def problems(self, used: Mapping[str, str]) -> list[str]:
+        """Return sentences about damaged or missing pictures; empty if there are none.
+
+        Parameters
+        ----------
+        used
+            SHA-256 of the pictures that must be there → what they belong to.
+        """
+        stored = self._database.rows("SELECT * FROM picture")
+        missing = used.keys() - {sha256 for sha256, *_ in stored}
         return [
-            f"calibration picture {name} is damaged"
-            for sha256, name, content in self._database.rows("SELECT * FROM picture")
-            if not _is_intact(content, sha256)
+            *(f"the picture of {used[sha256]} is missing" for sha256 in sorted(missing)),
+            *(
+                f"calibration picture {name} is damaged"
+                for sha256, name, content in stored
+                if not _is_intact(content, sha256)
+            ),
         ]
 
 

@@ -379,7 +379,7 @@ class SessionContents:
         """
         return self._database.problems() or [
             *self._documents.problems(),
-            *self._pictures.problems(),
+            *self._pictures.problems(self._documents.pictures()),
             *(self._frames.problems(progress) if recording else ()),
             *self._results.problems(),
         ]

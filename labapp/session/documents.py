@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, Never
 
@@ -211,6 +212,18 @@ class Documents:
                 "SELECT id, label, made, undone FROM change ORDER BY id"
             )
         )
+
+    def pictures(self) -> dict[str, str]:
+        """Return the SHA-256 of the pictures of the calibrations and of the bench check → kind."""
+        found: dict[str, str] = {}
+        kinds: tuple[Kind, ...] = ("laser-calibration", "plane-calibration", "bench-check")
+        for kind in kinds:
+            with suppress(InputError):  # `problems` reports it
+                document = self.get(kind)
+                for one in getattr(document, "pictures", (document,)):
+                    if sha256 := getattr(one, "picture_sha256", None):
+                        found[sha256] = kind
+        return found
 
     def problems(self) -> list[str]:
         """Return sentences about damaged documents and contradictions with the history."""

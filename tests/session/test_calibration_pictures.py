@@ -47,3 +47,14 @@ def test_laser_calibration_stores_its_picture(session: Session):
     assert stored is not None
     assert stored.picture_sha256 is not None
     np.testing.assert_array_equal(session.picture(stored.picture_sha256), picture)
+
+
+def test_deleted_pictures_are_reported(session: Session):
+    session.calibrate_plane(PICTURE, 6.35)
+    session.calibrate_laser([13.676], [18.561], [7.874], picture=np.zeros((10, 15), np.uint8))
+    assert session.problems() == []
+    with session._database.transaction() as connection:
+        connection.execute("DELETE FROM picture")
+    reported = " ".join(session.problems())
+    assert "laser-calibration is missing" in reported
+    assert "plane-calibration is missing" in reported
