@@ -131,7 +131,7 @@ def only_writer(target: Path) -> Iterator[bool]:
     """
     from filelock import FileLock, Timeout
 
-    path = target.with_name(f".{target.name}.lock")
+    path = target.parent / f".{target.name}.lock"  # "/" has no name
     lock = FileLock(path)
     try:
         lock.acquire(blocking=False)
