@@ -440,6 +440,12 @@ def test_ctrl_c_while_modules_load_is_no_internal_error(
     assert (code, stderr) == (130, "")
 
 
+def test_name_that_is_too_long_is_no_internal_error(labapp: Run, tmp_path: Path) -> None:
+    code, _, stderr = labapp("detect", SAMPLE / "calibration.png", "--out", tmp_path / ("x" * 400))
+    assert code == 2
+    assert "a shorter name" in stderr
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 def test_full_disk_of_stdout_is_no_internal_error(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
@@ -452,7 +458,7 @@ def test_full_disk_of_stdout_is_no_internal_error(tmp_path: Path) -> None:
             check=False,
         )
     assert process.returncode == 2
-    assert process.stderr.splitlines()[-1].startswith("labapp: output: no space left")
+    assert process.stderr.splitlines()[-1].startswith("labapp: output: file: No space left")
 
 
 def test_internal_error_is_reported_without_a_traceback(

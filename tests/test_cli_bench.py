@@ -75,6 +75,33 @@ def test_mirror_that_reflects_no_dot_is_not_predicted(
     assert ("not predicted" in result.output) is not is_predicted
 
 
+@pytest.mark.parametrize(
+    "more", [["a.png"], ["--use"], ["--out", "a.csv"], ["--free", "picture.u"]]
+)
+def test_prediction_ignores_no_option(setup: Path, more: list[str]):
+    arguments = ["calibrate", "bench", "--setup", str(setup), "--predict", *more]
+    assert isinstance(CliRunner().invoke(app, arguments).exception, InputError)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["bench", "--mirror", "plate:0", "--mirror", "plate:0", "--setup"],
+        ["pattern", "--height", "0", "--height", "1", "--out", "rays.csv", "--setup"],
+        ["plane", "--setup"],
+    ],
+)
+def test_a_picture_does_not_count_twice(
+    setup: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
+):
+    monkeypatch.chdir(setup.parent)
+    cv2.imwrite("a.png", np.zeros((9, 9), np.uint8))
+    Path("b.png").symlink_to("a.png")
+    result = CliRunner().invoke(app, ["calibrate", *command, str(setup), "a.png", "b.png"])
+    assert isinstance(result.exception, InputError)
+    assert result.exception.value == "given twice"
+
+
 def test_every_picture_needs_a_mirror(setup: Path):
     result = CliRunner().invoke(app, ["calibrate", "bench", "a.png", "--setup", str(setup)])
     assert result.exit_code != 0

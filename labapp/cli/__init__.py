@@ -40,6 +40,15 @@ from labapp.version import VERSION
 IMPATIENT_S = 2.0
 """A further interrupt within this time is ignored, as the first is still being handled, s."""
 
+OF_THE_USER = {
+    errno.ENOSPC: "some space where it goes",
+    errno.EFBIG: "files as large as the results to be allowed",
+    errno.EROFS: "a place that can be written",
+    errno.ENAMETOOLONG: "a shorter name",
+    errno.ELOOP: "links that end at a file or folder",
+}
+"""System errors that are no fault of labapp, wherever they are raised, and what would be right."""
+
 GROUPS = {
     "calibrate": ("labapp.cli.calibrate", "Calibrate laser or imaging plane, or check both."),
     "analyze": (
@@ -120,8 +129,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
             if stops:
                 # An interrupt during the import of a compiled module raises ImportError.
                 sys.exit(INTERRUPTED)
-            if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-                typer.echo("labapp: output: no space left where it goes; make some", err=True)
+            if isinstance(error, OSError) and error.errno in OF_THE_USER:
+                typer.echo(f"labapp: {_about(error)}", err=True)
                 sys.exit(BAD_INPUT)
             typer.echo(
                 f"labapp: a fault in the program: {type(error).__name__}: {error}\n"
@@ -130,6 +139,12 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
             )
             sys.exit(FAULT)
     sys.exit(0)
+
+
+def _about(error: OSError) -> InputError:
+    """Return a system error as bad input or output."""
+    where = "output" if error.filename is None else str(error.filename)
+    return InputError(where, "file", error.strerror, OF_THE_USER[error.errno or 0])
 
 
 def _commands() -> frozenset[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Collection, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -378,6 +379,15 @@ def check_target(
         raise InputError(out, option, "is an input of the command", expected)
     if out.suffix.lower() not in suffixes:
         raise InputError(out, option, "is there already, and of another kind", expected)
+
+
+def check_distinct(pictures: Collection[Path]) -> None:
+    """Raise `InputError` if a picture is given twice: its dots would count twice in every ±."""
+    seen = set[str]()
+    for picture in pictures:
+        if (place := os.path.realpath(picture)) in seen:
+            raise InputError(picture, "pictures", "given twice", "each picture once")
+        seen.add(place)
 
 
 def results_folder(out: Path | None, tables: bool = True) -> Path | None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING_MEASURED, check_target, warned
+from labapp.cli.shared import NOTHING_MEASURED, check_distinct, check_target, warned
 from labapp.errors import InputError
 from labapp.files import write_file
 from labapp.text import csv_text
@@ -68,6 +68,9 @@ def calibrate_bench(
     known = warned(parse_setup(before, setup))
     mirrors = [parse_mirror(one) for one in mirror or []]
     if predict:
+        if pictures or free or use or out is not None:
+            right = "no pictures, --free, --use or --out: nothing is adjusted"
+            raise InputError("--predict", "options", "with others", right)
         _print_forecast(known.rig, mirrors)
         return
     if out is not None:
@@ -91,6 +94,7 @@ def _checked(
 
     if not pictures:
         raise InputError("PICTURE", "pictures", "none", "one or more, or --predict")
+    check_distinct(pictures)
     if len(mirrors) != len(pictures):
         counts = f"{len(mirrors)} for {len(pictures)} pictures"
         raise InputError("--mirror", "mirrors", counts, "one for each picture, in their order")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from labapp.cli.calibrate.bench import mirror_picture
-from labapp.cli.shared import NOTHING_MEASURED, check_target, warned
+from labapp.cli.shared import NOTHING_MEASURED, check_distinct, check_target, warned
 from labapp.errors import InputError
 from labapp.files import write_file
 
@@ -85,6 +85,7 @@ def _check_options(
 ) -> None:
     from labapp.core.bench_check.pattern_calibration import LEAST_PICTURES
 
+    check_distinct(pictures)
     if len(height) != len(pictures) or len(set(height)) < LEAST_PICTURES:
         counts = f"{len(set(height))} for {len(pictures)} pictures"
         raise InputError("--height", "heights", counts, "one for each picture, two that differ")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from labapp.cli.calibrate.setup_file import SetupToChange, write_values
-from labapp.cli.shared import NOTHING_MEASURED
+from labapp.cli.shared import NOTHING_MEASURED, check_distinct
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
@@ -94,6 +94,7 @@ def _calibrated(
     from labapp.core.values import CannotMeasure
     from labapp.media import read_picture
 
+    check_distinct(images)
     pictures = [read_picture(path) for path in images]
     try:
         named = None if board is None else parse_board(board)
