@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import shutil
 from pathlib import Path
 
@@ -10,8 +11,10 @@ import numpy as np
 import pytest
 
 import labapp as package
+from labapp.core.surface.measures import SHAPES, SIZES
 from labapp.errors import InputError
 from labapp.export.folder import ExportChoice
+from labapp.export.result_folder import measured_in
 from labapp.session.session import Session
 from tests.conftest import Run
 
@@ -63,7 +66,6 @@ def test_tables_and_pictures_of_a_session(labapp: Run, gtaw: Path, tmp_path: Pat
 @pytest.mark.slow
 def test_result_folder_and_session_have_equal_dynamics(gtaw: Path, tmp_path: Path) -> None:
     from labapp.export.dynamics import dynamics_of
-    from labapp.export.result_folder import measured_in
 
     with Session.open(gtaw) as session:
         session.export(tmp_path / "results", ExportChoice(surfaces=frozenset({"csv"})))
@@ -99,6 +101,56 @@ def test_result_folder_and_session_have_equal_dynamics(gtaw: Path, tmp_path: Pat
     measures.write_text("\n".join([head, first, *others]), "utf-8")
     with pytest.raises(InputError, match="boundary"):
         dynamics_of(measured_in(measures.parent))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A results folder with one frame: a dome of 6 mm."""
+    folder = tmp_path_factory.mktemp("results")
+    theta = np.arange(-180.0, 180.0, 10.0)
+    x, y = 3 * np.cos(np.radians(theta)), 3 * np.sin(np.radians(theta))
+    lines = [f"0,{t},{a:.6f},{b:.6f},0" for t, a, b in zip(theta, x, y, strict=True)]
+    _write(folder / "boundary.csv", "frame,theta_deg,x_mm,y_mm,z_mm", lines)
+    grid = np.arange(-2.8, 2.9, 0.2)
+    nodes = [(a, b) for a in grid for b in grid if np.hypot(a, b) < 3]
+    lines = [f"{a:.4f},{b:.4f},{0.3 - (a * a + b * b) / 30:.6f}" for a, b in nodes]
+    _write(folder / "surface_000000.csv", "x_mm,y_mm,z_mm", lines)
+    sizes = dict.fromkeys((*SIZES, *SHAPES), "1")
+    names = ",".join(("frame", "time_s", "status", *sizes))
+    _write(folder / "measures.csv", names, [",".join(("0", "0.0", "ok", *sizes.values()))])
+    return folder
+
+
+def _write(path: Path, head: str, lines: list[str]) -> None:
+    path.write_text("\n".join([head, *lines, ""]), "utf-8")
+
+
+def test_results_of_one_frame_are_read(folder: Path) -> None:
+    assert len(list(measured_in(folder))) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "field"),
+    [
+        ("surface_000000.csv", "\n0.2000,0.0000,", "\n0.2000,0.0000,x", "z_mm"),
+        ("surface_000000.csv", "\n0.2000,0.0000,0", "\n0.2000,0.0000,1e300", "z_mm"),
+        ("surface_000000.csv", r"\n0.2000(.*\n)*", "\n", "points"),
+        ("surface_000000.csv", r"\n-?\d.\d000,", "\n0.0,", "points"),
+        ("boundary.csv", "z_mm", "x_mm", "line 1"),
+        ("boundary.csv", ",3.000000", ",1e300", "x_mm"),
+        ("measures.csv", "time_s", "frame", "line 1"),
+    ],
+)
+def test_damaged_results_are_rejected(
+    folder: Path, tmp_path: Path, name: str, old: str, new: str, field: str
+) -> None:
+    damaged = shutil.copytree(folder, tmp_path / "results")
+    text, count = re.subn(old, new, (damaged / name).read_text("utf-8"))
+    assert count > 0
+    (damaged / name).write_text(text, "utf-8")
+    with pytest.raises(InputError) as caught:
+        list(measured_in(damaged))
+    assert (Path(caught.value.source).name, caught.value.field) == (name, field)
 
 
 @pytest.mark.parametrize(

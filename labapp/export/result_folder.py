@@ -13,15 +13,20 @@ from labapp.config.csv_tables import bounded_lines, open_table, parse_number
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import CloughTocherSurface
 from labapp.core.surface.measures import SHAPES, SIZES
-from labapp.core.values import FloatArray
+from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
 from labapp.export.dynamics import MeasuredSurface, no_time_base
 
 LARGEST = 1 << 31
 """Largest table, bytes; boundary.csv of 100,000 frames has 1.5 GB, and is read row by row."""
 
+LARGEST_NUMBER = 1e9
+
 MOST_NODES = 200_000
 """Most nodes of a surface."""
+
+MOST_STEPS = 3
+"""Largest distance of the outermost nodes from the boundary, in steps of the grid."""
 
 KEPT_NODES = 800
 """Approximate number of nodes used of a surface, as pools are smooth."""
@@ -71,7 +76,11 @@ def measured_in(folder: Path) -> Iterator[MeasuredSurface]:
 def _rows(path: Path) -> Iterator[dict[str, str]]:
     """Yield the rows of a table, by column."""
     with open_table(path, WANTED, LARGEST) as file:
-        for row in csv.DictReader(bounded_lines(path, file, WANTED)):
+        reader = csv.DictReader(bounded_lines(path, file, WANTED))
+        names = reader.fieldnames or ()
+        if len(set(names)) < len(names):
+            raise InputError(path, "line 1", "a name twice", WANTED)
+        for row in reader:
             if None in row or None in row.values():
                 raise InputError(path, "row", "too many or too few cells", WANTED)
             yield row
@@ -80,8 +89,9 @@ def _rows(path: Path) -> Iterator[dict[str, str]]:
 def _number(path: Path, row: dict[str, str], name: str) -> float:
     cell = row.get(name)
     value = np.nan if cell == "" else parse_number(cell or "", ",")
-    if value is None:
-        raise InputError(path, name, "missing" if cell is None else cell, "a number")
+    if value is None or abs(value) > LARGEST_NUMBER:
+        right = f"a number up to {LARGEST_NUMBER:g}"
+        raise InputError(path, name, "missing" if cell is None else cell, right)
     return value
 
 
@@ -108,5 +118,19 @@ def _surface(path: Path, boundary: Boundary) -> CloughTocherSurface:
     rows = list(itertools.islice(_rows(path), MOST_NODES + 1))
     if len(rows) > MOST_NODES:
         raise InputError(path, "rows", f"more than {MOST_NODES}", WANTED)
-    nodes = _points(path, rows[:: max(1, -(-len(rows) // KEPT_NODES))])
-    return CloughTocherSurface(np.vstack([nodes, boundary.points_mm]))
+    nodes = _points(path, rows)
+    _check_extent(path, nodes[:, :2], boundary.points_mm[:, :2])
+    kept = nodes[:: max(1, -(-len(rows) // KEPT_NODES))]
+    try:
+        return CloughTocherSurface(np.vstack([kept, boundary.points_mm]))
+    except CannotMeasure as answer:
+        raise InputError(path, "points", answer.reason, WANTED) from answer
+
+
+def _check_extent(path: Path, nodes: FloatArray, outline: FloatArray) -> None:
+    """Raise unless the nodes, shape (n, 2), reach all sides of the boundary: others are missing."""
+    steps = [max(len(np.unique(places)) - 1, 1) for places in nodes.T]
+    furthest = MOST_STEPS * np.ptp(nodes, axis=0) / steps
+    for end in (np.min, np.max):
+        if (np.abs(end(nodes, axis=0) - end(outline, axis=0)) > furthest).any():
+            raise InputError(path, "points", "do not reach the boundary", WANTED)
