@@ -29,6 +29,9 @@ LARGEST_FILE = 1 << 29
 MOST_NODES = 1 << 24
 """Largest number of heights: a small file can claim any number, or name as many places."""
 
+FARTHEST_MM = 1e6
+"""Largest coordinate of a mesh, also of the faces that are not the pool."""
+
 SMALLEST_MM, LARGEST_MM = 0.5, 200.0
 """Limits of the longer side of a pool; other values indicate a wrong unit."""
 
@@ -202,8 +205,9 @@ def _mesh(path: Path, spacing_mm: float | None) -> tuple[Grid, FloatArray]:
     del spacing_mm
     data = read_limited(path, LARGEST_FILE, A_SURFACE)
     corners = _stl(data) if path.suffix.lower() == ".stl" else _ply(data)
-    if not np.isfinite(corners).all():
-        raise _Unreadable("corners that are nan or infinite", "finite numbers")
+    if not (np.abs(corners) <= FARTHEST_MM).all():
+        found = f"a corner at {np.abs(corners).max():g}"
+        raise _Unreadable(found, f"numbers up to {FARTHEST_MM:g} (mm)")
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     up = normal[:, 2] > 0.05 * np.linalg.norm(normal, axis=1)
     if up.sum() < 16:

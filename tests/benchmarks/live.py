@@ -253,6 +253,7 @@ class Run:
         def filmed(text: str, progress: Any) -> FilmedDevice:
             # As many pictures as in the same time, so that the oscillation is unchanged.
             rate = f"frames = {round(self.rate_hz / 5)}\nframe_rate_hz = {self.rate_hz:.1f}"
+            rate += '\nformat = "tif"'  # a video holds no rate above 1000 Hz
             text = re.sub(r"frames = \d+\nframe_rate_hz = [\d.]+", rate, text)
             self.device = FilmedDevice(pool_camera(text, progress).picture, self.rate_hz, most)
             return self.device

@@ -226,6 +226,16 @@ def test_top_of_a_closed_body_is_the_pool(tmp_path):
     assert_is_the_egg(read_pool(tmp_path / "body.stl"), size_mm=0.02)
 
 
+def test_mesh_with_a_corner_at_infinity_or_nearly_there_is_rejected(tmp_path):
+    vertices, faces = triangles()
+    far = np.array([[0.0, 0, -1e38], [0, 1, -1], [1, 0, -1]])  # of a wall, not of the pool
+    faces = np.concatenate([faces, [[len(vertices), len(vertices) + 2, len(vertices) + 1]]])
+    body = trimesh.Trimesh(np.concatenate([vertices, far]), faces, process=False)
+    body.export(tmp_path / "body.stl")
+    with pytest.raises(InputError, match=r"a corner at 1e\+38"):
+        read_pool(tmp_path / "body.stl")
+
+
 # --- invalid files ------------------------------------------------------------------------------
 
 
