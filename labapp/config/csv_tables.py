@@ -20,6 +20,9 @@ from labapp.files import regular_size
 LONGEST_LINE = 1 << 14
 HEAD_BYTES = 1 << 16
 
+LARGEST = 1e12
+"""Upper limit of numbers in tables; a time may be counted from 1904."""
+
 PROBLEMS_SHOWN = 10
 """Maximum number of problems of a table that are reported together."""
 
@@ -70,14 +73,17 @@ def bounded_lines(path: Path, file: TextIO, wanted: str) -> Iterator[str]:
 
 
 def parse_number(cell: str, separator: str) -> float | None:
-    """Parse a finite number, or return None; a decimal comma is allowed if not the separator."""
+    """Parse a number up to `LARGEST`, or return None.
+
+    A decimal comma is allowed if it is not the separator.
+    """
     if separator != ",":
         cell = cell.replace(",", ".")
     try:
         value = float(cell) if "_" not in cell else math.nan
     except ValueError:
         return None
-    return value if math.isfinite(value) else None
+    return value if abs(value) <= LARGEST else None
 
 
 class NumberCells:

@@ -213,6 +213,9 @@ class FeatureTable:
         read = read_columns(path, WANTED, LARGEST, ("recording",))
         names = read.pop("recording", None)
         columns = {name: of for name, of in read.items() if isinstance(of, np.ndarray)}
+        for name, values in columns.items():
+            if "_sigma" in name and (values < 0).any():
+                raise InputError(path, name, f"{values[values < 0][0]:g}", "0 or more, or nothing")
         features = tuple(name for name in columns if name in WITH_SIGMA)
         if not isinstance(names, list) or "time_s" not in columns or not features or not names:
             right = f"rows with recording, time_s and some of {', '.join(WITH_SIGMA)}"

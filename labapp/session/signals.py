@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, TextIO
 import numpy as np
 
 from labapp.config.csv_tables import (
+    LARGEST,
     PROBLEMS_SHOWN,
     NumberCells,
     bounded_lines,
@@ -40,8 +41,6 @@ A_WAV = "WAV (PCM of 8, 16 or 32 bits, or floats): current, voltage, wire feed, 
 
 LARGEST_FILE = 1 << 28
 MOST_ROWS = 500_000
-LARGEST = 1e12
-"""Upper limit of times and samples; a time may be counted from 1904."""
 LINES_ABOVE = 60
 """Most lines up to the header line; loggers write information above it."""
 

@@ -85,6 +85,8 @@ def test_table_can_be_read_as_a_matlab_file(tmp_path: Path) -> None:
         "recording,time_s,width_mm,width_mm\nweld,0,6,6\n",
         "recording,time_s,width_mm\n",
         "recording,time_s,width_mm\nweld,0,6,7\n",
+        "recording,time_s,width_mm\nweld,0,1e300\n",
+        "recording,time_s,width_mm,width_sigma_noise_mm\nweld,0,6,-0.1\n",
     ],
 )
 def test_invalid_table_is_rejected(text: str, tmp_path: Path) -> None:
