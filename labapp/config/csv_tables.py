@@ -31,6 +31,9 @@ PROBLEMS_SHOWN = 10
 def open_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
     """Open a table as UTF-8 text; errors of file, encoding and syntax become `InputError`.
 
+    Read it with ``csv.reader(…, strict=True)``: otherwise an open quotation mark takes all the rows
+    after it for text.
+
     Parameters
     ----------
     wanted
@@ -73,17 +76,14 @@ def bounded_lines(path: Path, file: TextIO, wanted: str) -> Iterator[str]:
 
 
 def parse_number(cell: str, separator: str) -> float | None:
-    """Parse a number up to `LARGEST`, or return None.
-
-    A decimal comma is allowed if it is not the separator.
-    """
+    """Parse a finite number, or return None; a decimal comma is allowed if not the separator."""
     if separator != ",":
         cell = cell.replace(",", ".")
     try:
         value = float(cell) if "_" not in cell else math.nan
     except ValueError:
         return None
-    return value if abs(value) <= LARGEST else None
+    return value if math.isfinite(value) else None
 
 
 class NumberCells:
@@ -96,10 +96,12 @@ class NumberCells:
         self._separator, self._signs = separator, set[str]()
 
     def parse(self, cell: str) -> float | None:
-        """Parse a cell by `parse_number`; None, too, if it has the other decimal sign."""
+        """Parse a cell by `parse_number`; None, too, if above `LARGEST` or with the other sign."""
         signs = self._signs.union(sign for sign in ".," if sign in cell)
         value = parse_number(cell, self._separator) if len(signs) < 2 else None
-        self._signs = self._signs if value is None else signs
+        if value is None or abs(value) > LARGEST:
+            return None
+        self._signs = signs
         return value
 
     @property
@@ -138,7 +140,8 @@ def read_columns(
         texts: dict[str, list[str]] = {name: [] for name in names if name in words}
         numbers = {name: array("d") for name in names if name not in words}
         number = NumberCells(separator)
-        for line, cells in enumerate(csv.reader(lines, delimiter=separator), 2):
+        rows = csv.reader(lines, delimiter=separator, strict=True)
+        for line, cells in enumerate(rows, 2):
             if not any(cells):
                 continue
             if len(cells) != len(names):

@@ -99,7 +99,7 @@ def read_rays(path: Path, setup: Mapping[str, Any]) -> tuple[IntArray, FloatArra
         If the file cannot be read, or anything in it is missing or impossible.
     """
     with open_table(path, A_RAY_TABLE, LARGEST_FILE) as file:
-        reader = csv.reader(bounded_lines(path, file, A_RAY_TABLE))
+        reader = csv.reader(bounded_lines(path, file, A_RAY_TABLE), strict=True)
         names = [cell.strip().lower() for cell in next(reader, [])]
         form = next((form for form in (UNIVERSAL, BEAM) if set(form) <= set(names)), None)
         if form is None or not set(LABELS) <= set(names):

@@ -76,7 +76,7 @@ def measured_in(folder: Path) -> Iterator[MeasuredSurface]:
 def _rows(path: Path) -> Iterator[dict[str, str]]:
     """Yield the rows of a table, by column."""
     with open_table(path, WANTED, LARGEST) as file:
-        reader = csv.DictReader(bounded_lines(path, file, WANTED))
+        reader = csv.DictReader(bounded_lines(path, file, WANTED), strict=True)
         names = reader.fieldnames or ()
         if len(set(names)) < len(names):
             raise InputError(path, "line 1", "a name twice", WANTED)

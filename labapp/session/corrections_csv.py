@@ -169,7 +169,9 @@ class _Reader:
         head = next(bounded, "")
         self._separator = max(",;\t", key=head.count)
         self._number = NumberCells(self._separator)
-        self._reader = csv.reader(itertools.chain([head], bounded), delimiter=self._separator)
+        self._reader = csv.reader(
+            itertools.chain([head], bounded), delimiter=self._separator, strict=True
+        )
         self._names = [name.strip() for name in next(self._reader, [])]
         self.has_frames = "frame" in self._names
         twice = [n for n in {*NEEDED, "frame", "blocked"} if self._names.count(n) > 1]

@@ -284,7 +284,7 @@ def _read(path: Path, file: TextIO) -> Signals:
     problems: list[InputError] = []
     held = {column.quantity: array("d") for column in columns}
     last, last_line = -math.inf, 0
-    reader, number = csv.reader(lines, delimiter=separator), NumberCells(separator)
+    reader, number = csv.reader(lines, delimiter=separator, strict=True), NumberCells(separator)
     for cells in reader:
         line = above + reader.line_num
         if not any(map(str.strip, cells)):

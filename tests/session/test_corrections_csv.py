@@ -125,6 +125,7 @@ def test_wrong_cells_are_reported_with_line_and_column(
         ("", "columns: no u_px, no v_px, no reflected_row, no reflected_column; expected a table"),
         ("u_px,v_px\n1,2\n", "columns: no reflected_row, no reflected_column"),
         (f"{HEAD},u_px\n1,2,3,4,5\n", "columns: u_px twice"),
+        (f'{HEAD},note\n1,2,5,5,\n9,2,5,6,"x\n9,9,6,6,\n', "syntax: unexpected end of data"),
         (f"{HEAD}\n", "rows: no dot; expected a row for each dot of the frame"),
         (f"frame,{HEAD}\n3,1,2,5,5\n", "rows: no dot of frame 0; expected"),
         (f"frame,{HEAD}\n{'9' * 5000},1,2,5,5\n", "line 2, frame: 9999"),

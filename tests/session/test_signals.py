@@ -57,6 +57,7 @@ def test_table_may_have_only_a_current(table) -> None:
         ("time,current\n0,1\ninf,2\n", "line 3, time", "inf"),
         ("about\n\ntime,current\n1,1\n1,2\n", "line 5, time", "1"),
         ("time,current\n0,1\n0.5,1,5\n", "line 3, cells", "3"),
+        ('time,current,gas\n0,1,Ar\n1,2,"Ar\n2,3,Ar\n', "syntax", "unexpected end of data"),
         ("time;current\n0.5;1\n1;1,234\n", "line 3, current", "1,234"),
         ("time;current\n0,5;1\n1.000;2\n", "line 3, time", "1.000"),
         ("time,current\n0,\n1,\n", "current, voltage, wire", "no numbers"),

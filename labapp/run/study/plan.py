@@ -355,7 +355,8 @@ def _read_csv(path: Path) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
         if "conditions" in header:
             each = "a column of its own for each condition"
             raise InputError(path, "line 1", "conditions", each)
-        for number, cells in enumerate(csv.reader(lines, delimiter=separator), 2):
+        rows = csv.reader(lines, delimiter=separator, strict=True)
+        for number, cells in enumerate(rows, 2):
             if not any(cells):
                 continue
             if len(cells) > len(header):

@@ -228,6 +228,13 @@ def test_column_of_conditions_is_refused(tmp_path: Path) -> None:
     assert fields(refused) == {"line 1"}
 
 
+def test_open_quotation_mark_loses_no_recording(tmp_path: Path) -> None:
+    text = 'file,setup,gas\na.avi,bench.toml,"argon\nb.avi,bench.toml,helium\n'
+    with pytest.raises(InputError) as refused:
+        read_study(write(tmp_path, text, "study.csv"))
+    assert fields(refused) == {"syntax"}
+
+
 @pytest.mark.parametrize("name", ["new.toml", "new.csv"])
 def test_refused_study_is_not_written(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
