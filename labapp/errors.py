@@ -9,10 +9,13 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from labapp.text import printable
-
 MAX_SHOWN = 80
 """Most characters of an invalid value that a message shows."""
+
+
+def printable(text: str) -> str:
+    """Return a line in which control characters, which a terminal would obey, are escaped."""
+    return "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
 
 
 class InputError(Exception):

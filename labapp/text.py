@@ -55,11 +55,6 @@ def marked_setup_words(status: str, words: str) -> str:
     return f"{SETUP_MARKS[status]} {words}" if words else ""
 
 
-def printable(text: str) -> str:
-    """Return a line in which control characters, which a terminal would obey, are escaped."""
-    return "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
-
-
 def now() -> str:
     """Return the current time, ISO 8601 with the time zone, to the second."""
     return datetime.now().astimezone().isoformat(timespec="seconds")

@@ -43,10 +43,10 @@ from labapp.cli.shared import (
     with_methods,
 )
 from labapp.core.schemes import scheme_words
-from labapp.errors import InputError
+from labapp.errors import InputError, printable
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS
 from labapp.session.results.statuses import is_measured
-from labapp.text import local_time, now, pluralize, printable
+from labapp.text import local_time, now, pluralize
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from labapp.cli.shared import SessionFile, frames_text
-from labapp.text import pluralize, printable
+from labapp.errors import printable
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.session.session import Session
