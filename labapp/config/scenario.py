@@ -186,7 +186,8 @@ def _recording(path: Path, values: dict[str, Any], rig: Rig) -> Recording:
     if exposure_s * rate > 1:
         expected = f"at most {1000 / rate:.6g} (ms), the time between frames"
         raise InputError(path, "recording.exposure_ms", wanted["exposure_ms"], expected)
-    look = Look(**values.get("look", {}))
+    # Plus 0, as NumPy draws no noise of a standard deviation of −0.
+    look = Look(**{key: value + 0 for key, value in values.get("look", {}).items()})
     if look.dot_floor_mm > look.dot_ceiling_mm:
         expected = f"a number up to look.dot_ceiling_mm, {look.dot_ceiling_mm:g} (mm)"
         raise InputError(path, "look.dot_floor_mm", look.dot_floor_mm, expected)
