@@ -619,7 +619,7 @@ def test_image_with_the_suffix_of_a_table_is_not_overwritten(labapp: Run, tmp_pa
         ("penetration onnx model.json --out model.json", "--out"),
         (f"calibrate bench a.png --mirror plate:0 --setup {SETUP} --out a.png", "--out"),
         (
-            f"calibrate pattern a.png a.png --height 0 --height 1 --setup {SETUP} --out a.png",
+            f"calibrate pattern a.png b.png --height 0 --height 1 --setup {SETUP} --out a.png",
             "--out",
         ),
     ],
