@@ -14,8 +14,11 @@ FATES = {
 }
 
 
-def draw_side(plot: Any, view: SideView) -> None:
-    """Draw the bench to scale into a plot of Y and Z; the first ray of each fate has a label."""
+def draw_side(plot: Any, view: SideView, roof_mm: float = 40.0) -> None:
+    """Draw the bench to scale into a plot of Y and Z; the first ray of each fate has a label.
+
+    The torch reaches up to a height of `roof_mm`; its width is not to scale.
+    """
     labelled: set[Fate] = set()
     for ray in view.rays:
         label = None if ray.fate in labelled else ray.fate.value
@@ -26,5 +29,6 @@ def draw_side(plot: Any, view: SideView) -> None:
     plot.plot(*view.plane_mm.T, "k", lw=1.8)
     plot.plot(*view.laser_mm, "ks", ms=4)
     tip = view.tip_mm[1]
-    plot.fill([0, 1.2, 1.2, -1.2, -1.2], [tip, tip + 4, 40, 40, tip + 4], "0.7", ec="0.3", lw=0.5)
+    torch = [(0, tip), (1.2, tip + 4), (1.2, roof_mm), (-1.2, roof_mm), (-1.2, tip + 4)]
+    plot.fill(*zip(*torch, strict=True), "0.7", ec="0.3", lw=0.5)
     plot.set(aspect="equal", ylabel="Z (mm)")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import platform
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import cv2
 import numpy as np
@@ -30,10 +31,8 @@ from labapp.session.report.results import (
     add_example,
     add_results,
 )
+from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM
 from labapp.version import VERSION
-
-POOL_MM = (7.0, 0.3)
-"""Length and height of the pool in the side view if none is expected or measured."""
 
 
 def report_pdf(
@@ -191,21 +190,24 @@ def _set_up(story: Story, report: ReportData) -> None:
         (0.22, 0.48, 0.3),
     )
     story.figure(
-        "The rig from the side, to scale: the central ray and the outer ones of its column, "
-        "reflected as from a flat work piece. The width of the torch is not to scale.",
+        "The rig from the side, to scale: the rays of the central column, reflected from a pool of "
+        "the mean measured size, else of the expected one. The width of the torch is not to scale.",
         figures.side_view(report.setup.rig, _pool_size(report)),
     )
 
 
-def _pool_size(report: ReportData) -> tuple[float, float]:
-    """Return length and height of the pool for the side view, mm: measured, else expected."""
-    record = report.session.record
-    length, height = data.values(report.lines, "length_mm"), data.values(report.lines, "height_mm")
-    depth = data.values(report.lines, "depth_mm")
+def _pool_size(report: ReportData) -> tuple[float, float, float]:
+    """Return width, length, height of the pool for the side view, mm: measured, else expected."""
+    record, values = report.session.record, partial(data.values, report.lines)
+    width, length = values("width_mm"), values("length_mm")
     if len(length):
-        peak = height.mean() if abs(height.mean()) >= abs(depth.mean()) else depth.mean()
-        return float(length.mean()), float(peak)
-    return record.expected_length_mm or POOL_MM[0], record.expected_height_mm or POOL_MM[1]
+        height, depth = values("height_mm").mean(), values("depth_mm").mean()
+        return float(width.mean()), float(length.mean()), float(max(height, depth, key=abs))
+    return (
+        record.expected_width_mm or USUAL_WIDTH_MM,
+        record.expected_length_mm or USUAL_LENGTH_MM,
+        record.expected_height_mm or 0.0,
+    )
 
 
 def _laser(story: Story, report: ReportData) -> None:

@@ -7,14 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.patches import Polygon
 
-from labapp.core.geometry.optics import (
-    intersect_imaging_plane,
-    intersect_level,
-    ray_directions,
-    reflect,
-)
 from labapp.core.geometry.rig import Rig
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.mesh import surface_mesh
@@ -22,7 +15,10 @@ from labapp.core.values import FloatArray
 from labapp.export.meshes import drawn_spacing
 from labapp.media import GreyImage
 from labapp.session.report.layout import DPI
+from labapp.simulation import positioning
+from labapp.simulation.positioning import SideView
 from labapp.studies.plotting import INCHES, as_bytes, new_figure, row_colour
+from labapp.studies.side_picture import draw_side
 
 STATES = {
     "measured": {"marker": "o", "color": "#1b4f8a", "markerfacecolor": "#1b4f8a"},
@@ -43,71 +39,46 @@ class Series:
     """Values and their σ, shape (n,); NaN if unknown."""
 
 
-def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
-    """Draw the rig from the side, to scale, with a pool of (length, height), mm."""
-    laser, plane = rig.laser.position_mm, rig.imaging_plane
-    top = plane.origin_mm + plane.height_mm * plane.z_axis
-    middle = (rig.pattern.columns - 1) // 2
-    fan = ray_directions(rig.laser, rig.pattern)[[0, (rig.pattern.rows - 1) // 2, -1], middle]
-    low, high = min(plane.origin_mm[1], top[1]) - 8, laser[1] + 12
-    floor, roof = -9.0, max(top[2], laser[2], 3 * rig.electrode.height_mm) + 7
+def side_view(rig: Rig, pool_mm: tuple[float, float, float]) -> bytes:
+    """Draw the rig from the side, to scale, with a pool of (width, length, height), mm."""
+    width, length, height = pool_mm
+    possible = abs(height) < width / 2
+    view = positioning.side_view(rig, width, length, height if possible else 0.0)
+    ends = np.array([*view.plane_mm, view.laser_mm])
+    low, high = ends[:, 0].min() - 8, view.laser_mm[0] + 12
+    floor, roof = -9.0, max(ends[:, 1].max(), 3 * view.tip_mm[1]) + 7
     with new_figure(INCHES, min(INCHES * (roof - floor) / (high - low) + 0.45, 4.5)) as figure:
-        view = figure.subplots()
-        view.axhspan(floor, 0, color="0.9", lw=0)
-        view.axhline(0, color="0.3", lw=0.8)
-        for k, direction in enumerate(fan):
-            _draw_ray(view, rig, direction, central=k == 1)
-        _draw_torch(view, rig.electrode.height_mm, roof)
-        across = np.linspace(-0.5, 0.5, 60)
-        pool = np.column_stack([pool_mm[0] * across, pool_mm[1] * (1 - 4 * across**2)])
-        view.add_patch(Polygon(pool, closed=True, fc="#c05a00", ec="#c05a00", lw=1.2, zorder=3))
-        view.plot([plane.origin_mm[1], top[1]], [plane.origin_mm[2], top[2]], "k", lw=2)
-        view.plot(laser[1], laser[2], "ks", ms=5)
-        _label_rig(view, rig, top)
-        view.set(xlim=(low, high), ylim=(floor, roof), aspect="equal")
-        view.set(xlabel="Y, along the weld (mm)", ylabel="Z (mm)")
+        plot = figure.subplots()
+        plot.axhspan(floor, 0, color="0.9", lw=0)
+        draw_side(plot, view, roof)
+        _label_rig(plot, rig, view)
+        plot.set(xlim=(low, high), ylim=(floor, roof), xlabel="Y, along the weld (mm)")
+        figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=7)
         return as_bytes(figure, dpi=DPI)
 
 
-def _draw_ray(view: Any, rig: Rig, direction: FloatArray, *, central: bool) -> None:
-    """Draw a ray to the work piece, and its reflection from a flat mirror to the imaging plane."""
-    laser = rig.laser.position_mm
-    foot = intersect_level(laser, direction)
-    after = reflect(direction, np.array([0.0, 0.0, 1.0]))
-    end = rig.imaging_plane.to_universal(intersect_imaging_plane(foot, after, rig.imaging_plane))
-    path = np.array([laser, foot, end])
-    look = {"color": "#b01030", "lw": 1.1} if central else {"color": "#d98a9a", "lw": 0.6}
-    view.plot(path[:, 1], path[:, 2], **look, zorder=2)
-
-
-def _draw_torch(view: Any, tip_mm: float, roof_mm: float) -> None:
-    """Draw the electrode as a tapered rod; its width is not to scale."""
-    rod = [(0, tip_mm), (1.2, tip_mm + 4), (1.2, roof_mm), (-1.2, roof_mm), (-1.2, tip_mm + 4)]
-    view.add_patch(Polygon(np.array(rod), closed=True, fc="0.75", ec="0.3", lw=0.6, zorder=1))
-
-
-def _label_rig(view: Any, rig: Rig, top: FloatArray) -> None:
-    laser, plane = rig.laser.position_mm, rig.imaging_plane
-    angle, origin = rig.laser.projection_angle_deg, plane.origin_mm
-    view.annotate("laser", laser[1:], (6, 4), textcoords="offset points")
-    view.annotate("imaging plane", top[1:], (5, -3), textcoords="offset points", va="top")
-    view.annotate("O′", origin[1:], (-4, 0), textcoords="offset points", ha="right")
-    torch = (1.2, max(rig.electrode.height_mm + 5, 0.55 * top[2]))
-    view.annotate("torch", torch, (5, 0), textcoords="offset points")
-    view.annotate("pool", (0, 0), (0, -11), textcoords="offset points", ha="center")
+def _label_rig(plot: Any, rig: Rig, view: SideView) -> None:
+    laser, (origin, top) = view.laser_mm, view.plane_mm
+    angle = rig.laser.projection_angle_deg
+    plot.annotate("laser", laser, (6, 4), textcoords="offset points")
+    plot.annotate("imaging plane", top, (-6, 4), textcoords="offset points")
+    plot.annotate("O′", origin, (-4, 0), textcoords="offset points", ha="right")
+    torch = (1.2, max(view.tip_mm[1] + 5, 0.55 * top[1]))
+    plot.annotate("torch", torch, (5, 0), textcoords="offset points")
+    plot.annotate("pool", (0, 0), (0, -11), textcoords="offset points", ha="center")
     reach = 0.42 * rig.laser.distance_mm
     arc = np.radians(np.linspace(0, angle, 40))
-    view.plot(reach * np.cos(arc), reach * np.sin(arc), "k", lw=0.6)
+    plot.plot(reach * np.cos(arc), reach * np.sin(arc), "k", lw=0.6)
     half = np.radians(angle / 2)
     at = (reach * np.cos(half), reach * np.sin(half))
-    view.annotate(f"α = {angle:.4g}°", at, (5, -3), textcoords="offset points")
-    along = laser[1:] * 0.72
-    view.annotate(
+    plot.annotate(f"α = {angle:.4g}°", at, (5, -3), textcoords="offset points")
+    along = laser * 0.72
+    plot.annotate(
         f"{rig.laser.distance_mm:.4g} mm", along, (-3, 5), textcoords="offset points", ha="right"
     )
     arrow = {"arrowstyle": "<->", "lw": 0.6, "color": "0.3"}
-    view.annotate("", (0, -6), (origin[1], -6), arrowprops=arrow)
-    view.annotate(f"{-origin[1]:.4g} mm", (origin[1] / 2, -5.6), ha="center", va="bottom")
+    plot.annotate("", (0, -6), (origin[0], -6), arrowprops=arrow)
+    plot.annotate(f"{-origin[0]:.4g} mm", (origin[0] / 2, -5.6), ha="center", va="bottom")
 
 
 def target_picture(image: GreyImage, points_px: Sequence[Sequence[float]]) -> bytes:
