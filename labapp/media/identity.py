@@ -8,7 +8,6 @@ from pathlib import Path
 from labapp.errors import os_errors_as_input
 from labapp.files import regular_size
 
-READ_BYTES = 1 << 20
 PAIRED = frozenset({".cih", ".cihx", ".mraw"})
 
 READABLE = "one that can be read"
@@ -28,11 +27,8 @@ def identify(path: Path) -> tuple[int, str]:
         digests = []
         for file in files:
             size += regular_size(file)
-            digest = hashlib.sha256()
             with file.open("rb") as stream:
-                while part := stream.read(READ_BYTES):
-                    digest.update(part)
-            digests.append((file.name, digest.hexdigest()))
+                digests.append((file.name, hashlib.file_digest(stream, "sha256").hexdigest()))
     if len(files) == 1 and files[0] == path:
         return size, digests[0][1]
     return size, hashlib.sha256(repr(digests).encode()).hexdigest()

@@ -57,14 +57,11 @@ class SimulatedWeld:
     ----------
     series
         Measured features and the scan of the back side.
-    speed_mm_s
-        Travel speed.
     back_width_mm
         True width of the back-side bead at each frame, shape (n,).
     """
 
     series: WeldSeries
-    speed_mm_s: float
     back_width_mm: FloatArray
 
 
@@ -102,7 +99,7 @@ def _weld(name: str, rng: np.random.Generator) -> SimulatedWeld:
     noise = np.where(back[frame] > 0, rng.normal(0, SCAN_SIGMA_MM, len(frame)), 0.0)
     target[frame] = np.maximum(back[frame] + noise, 0.0)
     parts = np.tile(NOISE, (len(time_s), 1)), np.tile(LEVEL, (len(time_s), 1))
-    return SimulatedWeld(WeldSeries(name, time_s, measured, *parts, target, sigma), speed, back)
+    return SimulatedWeld(WeldSeries(name, time_s, measured, *parts, target, sigma), back)
 
 
 def first_order_lag(

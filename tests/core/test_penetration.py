@@ -216,12 +216,13 @@ def test_features_are_held_no_longer_in_a_cross_validation() -> None:
     in_gap = abs(np.arange(200) - 90)[:, None] < MOST_HELD
     welds = [replace(one, value=np.where(in_gap, np.nan, one.value)) for one in linear_welds(4, 1)]
     model, left_out = validated_model(welds, "arx", settings)
-    direct = fit_model(welds, "arx", settings)
+    steps = [in_steps(one, STEP_S) for one in welds]
+    direct = fit_model(steps, "arx", settings)
     assert model.time_constants_s == direct.time_constants_s
     assert model.scatter_mm == direct.scatter_mm
-    for one in welds:
-        others = [each for each in welds if each is not one]
-        expected = fit_model(others, "arx", settings, like=direct).predict(one)
+    for one in steps:
+        others = [each for each in steps if each is not one]
+        expected = fit_model(others, "arx", settings, like=direct).predict_steps(one)
         of = np.array([name == one.name for name in left_out.weld])
         at = np.rint((left_out.time_s[of] - expected.time_s[0]) / STEP_S).astype(int)
         assert left_out.predicted[of] == pytest.approx(expected.value[at])

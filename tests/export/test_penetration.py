@@ -17,7 +17,7 @@ import pytest
 from scipy.io import loadmat
 
 from labapp.core.dynamics.penetration import ModelSettings, PenetrationModel, fit_model
-from labapp.core.dynamics.weld_series import Orders, WeldSeries
+from labapp.core.dynamics.weld_series import Orders, WeldSeries, in_steps
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import Measures
 from labapp.errors import InputError
@@ -38,7 +38,8 @@ WELDS = tuple(one.series for one in simulate_welds(4, 2))
 @cache
 def fitted(kind: str) -> PenetrationModel:
     settings = ModelSettings(FEATURES, TARGET, orders=Orders(1, 2, 1), full_mm=0.5)
-    model = fit_model(WELDS[:3], kind, settings)  # type: ignore[arg-type]
+    steps = [in_steps(one, settings.step_s) for one in WELDS[:3]]
+    model = fit_model(steps, kind, settings)  # type: ignore[arg-type]
     return replace(model, factor=1.2, rmse_mm=0.1)
 
 
@@ -337,8 +338,6 @@ def test_predictions_are_marked_with_their_model(model: PenetrationModel) -> Non
 def test_onnx_gives_equal_values(model: PenetrationModel, tmp_path: Path) -> None:
     import onnx
     from onnx.reference import ReferenceEvaluator
-
-    from labapp.core.dynamics.weld_series import in_steps
 
     write_onnx(tmp_path / "model.onnx", model)
     graph = onnx.load(tmp_path / "model.onnx")

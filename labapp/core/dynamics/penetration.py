@@ -184,7 +184,7 @@ def _rows(steps: Sequence[WeldSeries], response: FloatArray, orders: Orders) -> 
 
 
 def fit_model(
-    welds: Sequence[WeldSeries],
+    steps: Sequence[WeldSeries],
     kind: Kind,
     settings: ModelSettings,
     like: PenetrationModel | None = None,
@@ -193,8 +193,8 @@ def fit_model(
 
     Parameters
     ----------
-    welds
-        Welds with the features of the settings, in their order.
+    steps
+        Welds as averaged by `in_steps`, with the features of the settings, in their order.
     kind
         ``arx``, or ``gp``, which needs scikit-learn.
     settings
@@ -209,16 +209,6 @@ def fit_model(
     ImportError
         If scikit-learn is missing.
     """
-    return _fit_steps([in_steps(one, settings.step_s) for one in welds], kind, settings, like)
-
-
-def _fit_steps(
-    steps: Sequence[WeldSeries],
-    kind: Kind,
-    settings: ModelSettings,
-    like: PenetrationModel | None = None,
-) -> PenetrationModel:
-    """As `fit_model`, from features that `in_steps` averaged."""
     constants = _find_time_constants(steps, settings, like)
     rows = _rows(steps, impulse_response(constants, settings.step_s), settings.orders)
     width = rows.x.shape[1]
@@ -346,7 +336,9 @@ def validated_model(
 
     Parameters
     ----------
-    welds, kind, settings
+    welds
+        Welds with the features of the settings, in their order.
+    kind, settings
         As in `fit_model`.
     progress
         Called with the number of completed fits and their total; may raise to stop.
@@ -354,7 +346,7 @@ def validated_model(
     Raises
     ------
     ValueError
-        As `fit_model` does, or if there are fewer than three welds with sections.
+        As `in_steps` and `fit_model` do, or if there are fewer than three welds with sections.
     ImportError
         If scikit-learn is missing.
     """
@@ -362,13 +354,13 @@ def validated_model(
     used = [one for one in steps if np.isfinite(one.target).any()]
     if len(used) < 3:
         raise ValueError(f"{len(used)} welds have sections; 3 are needed")
-    model = _fit_steps(used, kind, settings)
+    model = fit_model(used, kind, settings)
     names: list[str] = []
     parts = []
     for done, one in enumerate(used, 1):
         progress(done, len(used) + 1)
         others = [each for each in used if each is not one]
-        found = _fit_steps(others, kind, settings, like=model).predict_steps(one)
+        found = fit_model(others, kind, settings, like=model).predict_steps(one)
         cut = np.isfinite(one.target) & np.isfinite(found.value)
         names += [one.name] * int(cut.sum())
         columns = one.time_s, one.target, one.target_sigma, found.value, found.sigma

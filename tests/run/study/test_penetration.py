@@ -10,6 +10,7 @@ import pytest
 
 from labapp import Study
 from labapp.core.dynamics.penetration import ModelSettings, fit_model
+from labapp.core.dynamics.weld_series import in_steps
 from labapp.export.penetration import write_model
 from labapp.simulation.penetration import FEATURES, TARGET, simulate_welds
 from tests.conftest import Run
@@ -84,8 +85,9 @@ def test_model_of_a_study_predicts_its_sections(
 def test_shape_features_need_no_exported_surfaces(
     simulated: Path, tmp_path: Path, labapp: Run
 ) -> None:
-    welds = [weld.series for weld in simulate_welds(3, 1)]
-    model = fit_model(welds, "arx", ModelSettings(FEATURES, TARGET))
+    settings = ModelSettings(FEATURES, TARGET)
+    steps = [in_steps(weld.series, settings.step_s) for weld in simulate_welds(3, 1)]
+    model = fit_model(steps, "arx", settings)
     write_model(tmp_path / "model.json", replace(model, rmse_mm=0.1))
     for options in ([], ["--warm"]):
         out = tmp_path / f"results{len(options)}"
