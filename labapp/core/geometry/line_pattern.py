@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig, turned
 from labapp.core.values import FloatArray
 
 
@@ -57,9 +57,7 @@ class LinePattern:
         """
         up = np.tan(((self.count + 1) / 2 - line) * np.radians(self.interline_angle_deg))
         tangents = np.stack(np.broadcast_arrays(np.tan(fan), up), axis=-1)
-        turn = np.radians(self.rotation_deg)
-        sin, cos = np.sin(turn), np.cos(turn)
-        return np.asarray(tangents @ np.array([[cos, sin], [-sin, cos]]))
+        return turned(tangents, self.rotation_deg)
 
 
 KIND = "lines"
@@ -126,7 +124,4 @@ def line_directions(
     laser: Laser, pattern: LinePattern, line: FloatArray, fan: FloatArray
 ) -> FloatArray:
     """Unit directions of the rays of lines, shape (…, 3); see `LinePattern.tangents`."""
-    axis, across, along = laser.axes
-    tangents = pattern.tangents(line, fan)
-    direction = axis + tangents[..., :1] * across + tangents[..., 1:] * along
-    return np.asarray(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+    return laser.directions(pattern.tangents(line, fan))

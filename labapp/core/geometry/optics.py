@@ -21,12 +21,9 @@ def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
         Shape (rows, columns, 3), read-only; ray (i, j), counted from 1, is at
         ``[i - 1, j - 1]``. i grows with Y on the work piece, j with X.
     """
-    axis, across, along = laser.axes
-    tangents = pattern.tangents
-    direction = axis + tangents[..., :1] * across + tangents[..., 1:] * along
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction = laser.directions(pattern.tangents)
     direction.flags.writeable = False
-    return np.asarray(direction)
+    return direction
 
 
 def surface_normal(gradient: FloatArray) -> FloatArray:

@@ -61,6 +61,19 @@ class Laser:
         position.flags.writeable = False
         return position
 
+    def directions(self, tangents: FloatArray) -> FloatArray:
+        """Unit directions, shape (…, 3), of rays by their tangents to the beam axis, (…, 2)."""
+        axis, across, along = self.axes
+        direction = axis + tangents[..., :1] * across + tangents[..., 1:] * along
+        return np.asarray(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+
+
+def turned(tangents: FloatArray, angle_deg: float) -> FloatArray:
+    """Rotate a pattern of tangents, shape (…, 2), about the beam axis."""
+    turn = np.radians(angle_deg)
+    sin, cos = np.sin(turn), np.cos(turn)
+    return np.asarray(tangents @ np.array([[cos, sin], [-sin, cos]]))
+
 
 def _rays(rows: int, columns: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(1, rows + 1) for j in range(1, columns + 1)]
@@ -124,11 +137,7 @@ class DotPattern:
             tangents = np.asarray(steps * np.tan(step))
         else:
             tangents = PATTERNS[self.kind].tangents(self.rows, self.columns, step)
-        if not self.rotation_deg:
-            return tangents
-        turn = np.radians(self.rotation_deg)
-        sin, cos = np.sin(turn), np.cos(turn)
-        return np.asarray(tangents @ np.array([[cos, sin], [-sin, cos]]))
+        return turned(tangents, self.rotation_deg) if self.rotation_deg else tangents
 
     @cached_property
     def absent_rays(self) -> frozenset[tuple[int, int]]:

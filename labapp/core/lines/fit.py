@@ -262,8 +262,7 @@ def _cost(model: LineModel, coefficients: FloatArray, data: LineData) -> float:
 
 def _robust(residual: FloatArray) -> FloatArray:
     """Huber loss of residuals: quadratic up to 3, linear beyond."""
-    size = np.abs(residual)
-    return np.asarray(np.where(size < 3.0, size**2, 6.0 * size - 9.0))
+    return np.asarray(2.0 * scipy.special.huber(3.0, residual))
 
 
 def _weights(residual: FloatArray) -> FloatArray:

@@ -145,12 +145,8 @@ def _band(strip: Grey, width: float) -> Grey:
 
 
 def _down(strip: Grey, sigma: float) -> Grey:
-    reach = int(np.ceil(3 * sigma))
-    bell = np.exp(-(np.arange(-reach, reach + 1.0) ** 2) / (2 * sigma**2))
-    kernel = (bell / bell.sum()).astype(np.float32)
-    one = np.ones(1, np.float32)
-    down = cv2.sepFilter2D(strip, cv2.CV_32F, one, kernel, borderType=cv2.BORDER_REFLECT)
-    return np.asarray(down)
+    size = (1, 2 * int(np.ceil(3 * sigma)) + 1)
+    return np.asarray(cv2.GaussianBlur(strip, size, sigma, borderType=cv2.BORDER_REFLECT))
 
 
 def _robust_shape(
