@@ -79,29 +79,38 @@ def pluralize(count: int, noun: str) -> str:
 BYTES = ("bytes", "kB", "MB", "GB", "TB")
 
 
-def fixed(value: float, decimals: int) -> str:
+MINUS = "−"
+"""Minus sign, as wide as a plus; a hyphen reads as a dash."""
+
+NOTHING = "–"
+"""Placeholder for a missing number."""
+
+
+def plain(value: float, decimals: int) -> str:
     """A number with the given decimals (negative: rounded to tens, …), never a negative zero."""
-    return f"{round(value, decimals):z.{max(decimals, 0)}f}"
+    return f"{round(value, decimals):z.{max(decimals, 0)}f}".replace("-", MINUS)
 
 
-def rounded(value: float, sigma: float, decimals: int = 3) -> tuple[str, str]:
+def rounded(value: float | None, sigma: float | None, decimals: int = 3) -> tuple[str, str]:
     """Text of a value and of its σ: σ to two significant digits, the value to the same place.
 
     Parameters
     ----------
-    sigma
-        NaN if unknown.
+    value, sigma
+        None or NaN if unknown.
     decimals
         Decimals of the value if σ is unknown or 0; the text of σ is empty then.
     """
-    if not (math.isfinite(sigma) and sigma > 0):
-        return fixed(value, decimals), ""
+    if value is None or not math.isfinite(value):
+        return NOTHING, ""
+    if sigma is None or not (math.isfinite(sigma) and sigma > 0):
+        return plain(value, decimals), ""
     # Rounding may carry: 0.0996 to two digits is 0.10.
     place = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))
-    return fixed(value, place), fixed(sigma, place)
+    return plain(value, place), plain(sigma, place)
 
 
-def with_sigma(value: float, sigma: float) -> str:
+def with_sigma(value: float | None, sigma: float | None) -> str:
     """A value and its σ in one text: "5.003 ± 0.010", see `rounded`."""
     return " ± ".join(filter(None, rounded(value, sigma)))
 

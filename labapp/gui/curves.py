@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
-from labapp.gui.digits import rounded
+from labapp.text import rounded
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp import text
-
-MINUS = "−"
-"""Minus sign, as wide as a plus; a hyphen reads as a dash."""
-
-NOTHING = "–"
-"""Placeholder for a missing number."""
+from labapp.text import MINUS, NOTHING, csv_text, plain, rounded
 
 EXTRA_DECIMALS = 3
 """Largest number of additional decimals that a field shows because they were entered."""
@@ -45,32 +39,6 @@ class ResultRow:
         return self.name, value, sigma, self.unit
 
 
-def rounded(value: float | None, sigma: float | None, decimals: int = 3) -> tuple[str, str]:
-    """Text of a value and of its σ: σ to two significant digits, the value to the same place.
-
-    Parameters
-    ----------
-    value, sigma
-        None or NaN if unknown.
-    decimals
-        Decimals of the value if σ is unknown or 0.
-    """
-    if value is None or not math.isfinite(value):
-        return NOTHING, ""
-    number, spread = text.rounded(value, math.nan if sigma is None else sigma, decimals)
-    return number.replace("-", MINUS), spread
-
-
-def with_sigma(value: float | None, sigma: float | None) -> str:
-    """A value and its σ in one text: "5.003 ± 0.010", see `rounded`."""
-    return " ± ".join(filter(None, rounded(value, sigma)))
-
-
-def plain(value: float, decimals: int) -> str:
-    """A number with the given decimals (negative: rounded to tens, …), never a negative zero."""
-    return text.fixed(value, decimals).replace("-", MINUS)
-
-
 def entered(value: float, decimals: int) -> str:
     """A number in a field: with the field's decimals, or a few more if more were entered."""
     whole = np.format_float_positional(value, trim="-")
@@ -95,7 +63,7 @@ def as_text(rows: Iterable[ResultRow]) -> str:
 def as_csv(rows: Iterable[ResultRow]) -> str:
     """Result rows as comma-separated values at full precision, for a program."""
     cells = ((row.name, row.value, row.sigma, row.unit) for row in rows)
-    return text.csv_text([("quantity", "value", "sigma", "unit"), *cells])
+    return csv_text([("quantity", "value", "sigma", "unit"), *cells])
 
 
 def round_factor(most: float) -> float:

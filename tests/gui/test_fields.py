@@ -6,11 +6,12 @@ import pytest
 from PySide6.QtCore import QCoreApplication, Qt
 from PySide6.QtGui import QGuiApplication
 
-from labapp.gui.digits import NOTHING, ResultRow, as_csv, entered, parsed, plain, rounded
+from labapp.gui.digits import ResultRow, as_csv, entered, parsed
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import heading
 from labapp.gui.widgets.path_field import PathField, PathLine
 from labapp.gui.widgets.result_table import ResultTable
+from labapp.text import NOTHING, plain, rounded
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QAccessible, QAccessibleEvent, QPalette
 from PySide6.QtWidgets import QFrame, QGridLayout, QLabel, QWidget
 
-from labapp.gui.digits import NOTHING, plain
 from labapp.gui.shell.steps import setup_to_do
 from labapp.gui.theme import RED, FollowsTheme, is_dark
 from labapp.gui.widgets.buttons import button
@@ -22,7 +21,7 @@ from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_trend import Pace
 from labapp.session.session import Session
-from labapp.text import marked_setup_words, pluralize, setup_words
+from labapp.text import NOTHING, marked_setup_words, plain, pluralize, setup_words
 
 DECIMALS = 3
 """Number of decimals of live figures in mm."""

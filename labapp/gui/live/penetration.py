@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 from PySide6.QtWidgets import QWidget
 
 from labapp.gui.dialogs import ask_file
-from labapp.gui.digits import NOTHING
 from labapp.gui.live.figures import DECIMALS, Figure
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import Message
 from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.gui.workspace import Workspace
 from labapp.run.live_watch import LiveWatch
-from labapp.text import split_unit
+from labapp.text import NOTHING, split_unit
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.penetration import PenetrationModel

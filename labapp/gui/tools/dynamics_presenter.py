@@ -11,11 +11,10 @@ import numpy as np
 from labapp.core.dynamics.oscillation import FEWEST
 from labapp.core.surface.measures import WITH_SIGMA
 from labapp.gui.curves import titled
-from labapp.gui.digits import with_sigma
 from labapp.gui.pages.trends.presenter import SIGNALS
 from labapp.session.results.trends import BY_KEY
 from labapp.studies.tables import Table
-from labapp.text import pluralize
+from labapp.text import pluralize, with_sigma
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics

@@ -8,12 +8,11 @@ from pathlib import Path
 from labapp.config.setup import read_setup
 from labapp.core.surface.measures import SIZES
 from labapp.errors import InputError
-from labapp.gui.digits import with_sigma
 from labapp.run.study.plan import StudyPlan, matching_recordings, shown_condition
 from labapp.run.study.status import STATE_WORDS, RecordingStatus, State
 from labapp.run.study.summary import StudySummary
 from labapp.studies.tables import Table
-from labapp.text import axis_label, column_heading, pluralize
+from labapp.text import axis_label, column_heading, pluralize, with_sigma
 
 SIGNS: dict[State, str] = {"done": "✓", "part": "◐", "waiting": "○", "failed": "▲"}
 

@@ -16,10 +16,10 @@ from PySide6.QtWidgets import (
     QTableWidgetItem,
 )
 
-from labapp.gui.digits import NOTHING, cell_text
+from labapp.gui.digits import cell_text
 from labapp.gui.widgets.buttons import add_menu
 from labapp.gui.widgets.labels import plain_tip
-from labapp.text import column_heading
+from labapp.text import NOTHING, column_heading
 
 if TYPE_CHECKING:
     from labapp.studies.tables import Table

@@ -28,7 +28,6 @@ from labapp.core.bench_check.suspects import Suspect
 from labapp.core.geometry.uncertainty import INDEX
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.values import CannotMeasure
-from labapp.gui.digits import with_sigma
 from labapp.gui.pages.bench_check import presenter
 from labapp.gui.pages.bench_check.page import BenchCheckPage
 from labapp.gui.pages.bench_check.presenter import CheckResult, ListedPicture
@@ -40,7 +39,7 @@ from labapp.session.session import Session
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import trace
 from labapp.simulation.render import Look, render
-from labapp.text import SETUP_MARKS
+from labapp.text import SETUP_MARKS, with_sigma
 from tests.gui.conftest import KEPT
 from tests.mirrors import FlatMirror
 from tests.waiting import PATIENCE_S

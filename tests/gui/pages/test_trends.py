@@ -11,12 +11,12 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.digits import with_sigma
 from labapp.gui.pages.trends.page import TrendsPage
 from labapp.gui.pages.trends.presenter import CORRECTED, STALE, TrendOptions, show
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.session.signals import Signals
+from labapp.text import with_sigma
 from tests.gui.conftest import KEPT, let_draw
 
 

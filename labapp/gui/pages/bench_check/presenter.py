@@ -31,12 +31,12 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.images.find_dots import DotSettings, find_mirror_dots
 from labapp.core.values import CannotMeasure, FloatArray
-from labapp.gui.digits import plain, round_factor, with_sigma
+from labapp.gui.digits import round_factor
 from labapp.gui.pages.bench_check.listed_picture import ListedPicture
 from labapp.media.formats.images import IMAGE_SUFFIXES
 from labapp.session.record import BenchCheckRecord, MirrorPicture, Record
 from labapp.session.session import Session
-from labapp.text import now
+from labapp.text import now, plain, with_sigma
 
 PICTURES = IMAGE_SUFFIXES
 """Suffixes of pictures that can be dropped on the page."""

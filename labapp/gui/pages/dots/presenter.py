@@ -18,11 +18,11 @@ from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.errors import InputError
-from labapp.gui.digits import ResultRow, plain
+from labapp.gui.digits import ResultRow
 from labapp.gui.tasks import Cancelled, Control
 from labapp.session.results.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
-from labapp.text import SIGMA_OF, pluralize
+from labapp.text import SIGMA_OF, plain, pluralize
 
 NO_PLACES: FloatArray = np.zeros((0, 2))
 

@@ -10,7 +10,6 @@ from labapp.core.pipeline import Measurement, reconstruct
 from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.values import CannotMeasure
 from labapp.export.rendering.scene import Scene, difference_scene
-from labapp.gui.digits import rounded
 from labapp.gui.pages.surface.presenter import (
     ERRORS,
     SCHEMES,
@@ -20,6 +19,7 @@ from labapp.gui.pages.surface.presenter import (
     with_scheme,
 )
 from labapp.session.session import Session
+from labapp.text import rounded
 
 Row = tuple[str, str, str, str, str]
 """Quantity, value of the first and of the other, first minus other, unit."""

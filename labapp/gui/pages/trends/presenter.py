@@ -13,7 +13,7 @@ import numpy as np
 from labapp.core.lines.track import oscillation_frequency
 from labapp.core.values import FloatArray, IntArray
 from labapp.gui.curves import Axis, Curve, Mark
-from labapp.gui.digits import ResultRow, rounded
+from labapp.gui.digits import ResultRow
 from labapp.session.results.line_trends import (
     FEWEST,
     LINE_QUANTITIES,
@@ -31,7 +31,7 @@ from labapp.session.results.trends import (
 )
 from labapp.session.session import Session
 from labapp.session.signals import Signals
-from labapp.text import SIGMA_OF, marked_setup_words
+from labapp.text import SIGMA_OF, marked_setup_words, rounded
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.steps import Event
