@@ -13,7 +13,7 @@ from labapp.core.sequence.mean import series_of, sigma_of_mean
 from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
 from labapp.export.frame_result import FrameResult
-from labapp.text import setup_words
+from labapp.text import pluralize, setup_words
 
 MEANS = {
     "width": "width_mm",
@@ -53,7 +53,7 @@ class Summary:
     def text(self) -> str:
         """Return the number of frames and mean sizes as text, one line each."""
         count = len(self.frames)
-        total = f"{count} frame{'s' * (count != 1)}, {self.statuses['ok']} with a surface"
+        total = f"{pluralize(count, 'frame')}, {self.statuses['ok']} with a surface"
         without = [f"{n} {status}" for status, n in self.statuses.items() if status != "ok"]
         lines = [f"{total} ({', '.join(without)})" if without else total]
         known = series_of([each for _, _, each in self.frames if each is not None])

@@ -16,6 +16,7 @@ from labapp.core.rows.correction import Correction
 from labapp.core.rows.lattice import Site
 from labapp.core.values import FloatArray, IntArray
 from labapp.gui.pages.dots import picking
+from labapp.text import pluralize
 
 Commit = Callable[[str, Callable[[], Correction | None]], bool]
 """Makes an edit, one step of that name; reports an error and returns False if refused."""
@@ -153,13 +154,13 @@ class Editor:
     def assign(self, row: int | None = None, column: int | None = None) -> bool:
         """Set the row, the column or both of the selected dots."""
         chosen, what = self.selection, "row" if column is None else "column"
-        label = f"{what} of {_count(chosen)}"
+        label = f"{what} of {pluralize(len(chosen), 'dot')}"
         return self._edit(label, lambda c: core.assign(c, chosen, row, column))
 
     def number(self) -> bool:
         """Set the row and column of the selected dots from their neighbours."""
         chosen = self.selection
-        label = f"number {_count(chosen)}"
+        label = f"number {pluralize(len(chosen), 'dot')}"
         return self._edit(label, lambda c: picking.numbered_by_neighbours(c, chosen))
 
     def put_in_doubt(self) -> bool:
@@ -242,12 +243,8 @@ class Editor:
         return self._commit(label, made)
 
 
-def _count(dots: IntArray) -> str:
-    return f"{len(dots)} dot{'s' * (len(dots) != 1)}"
-
-
 def _of(what: str, dots: IntArray) -> str:
-    return f"{what}: {_count(dots)}"
+    return f"{what}: {pluralize(len(dots), 'dot')}"
 
 
 def _named(rows: list[int]) -> str:

@@ -17,6 +17,7 @@ from labapp.gui.digits import ResultRow, parsed
 from labapp.gui.pages.setup.presenter import shown as setup_shown
 from labapp.gui.shell.steps import calibrations_in_use
 from labapp.session.session import Session
+from labapp.text import pluralize
 
 NAMES = ("l₁", "l₂", "l₃")
 
@@ -224,7 +225,7 @@ def _mean_row(name: str, meaning: str, lengths: FloatArray) -> ResultRow:
     mean = float(lengths.mean()) if count else None
     spread = float(lengths.std(ddof=1)) if count > 1 else None
     note = f"{meaning}; mean and standard deviation of {count} readings"
-    return ResultRow(f"{name}, {count} reading{'s' * (count != 1)}", mean, spread, "mm", 2, note)
+    return ResultRow(f"{name}, {pluralize(count, 'reading')}", mean, spread, "mm", 2, note)
 
 
 def _spoken(words: str) -> str:

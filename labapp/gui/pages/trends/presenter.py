@@ -31,7 +31,7 @@ from labapp.session.results.trends import (
 )
 from labapp.session.session import Session
 from labapp.session.signals import Signals
-from labapp.text import SIGMA_OF, marked_setup_words, rounded
+from labapp.text import SIGMA_OF, marked_setup_words, pluralize, rounded
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.steps import Event
@@ -242,7 +242,7 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
         for sigma in (found.deviation, found.mean_sigma)
     )
     ends = [f"{end:.{place}f}" for end in (found.lowest, found.highest)]
-    frames = f"{found.count} frame{'s' * (found.count != 1)}"
+    frames = pluralize(found.count, "frame")
     note = f"Mean and standard deviation (divided by n, Eq. 7-2 … 7-4) of {frames}"
     sure = (
         f"± of the mean, {SIGMA_OF}: frames with the same outline share the error of the level, "
