@@ -19,12 +19,12 @@ import numpy.typing as npt
 import tifffile
 
 from labapp.core.geometry.rig import Rig
-from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray
 from labapp.simulation.calibration.target import Target, TargetLook, render_target
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, Reflections, trace
 from labapp.simulation.parallel import Progress, held, hold, processes, wait_for
-from labapp.simulation.render import GreyImage, Look, Picture, ray_brightness, render
+from labapp.simulation.render import GreyImage, Look, Picture, RenderedFrame, ray_brightness, render
 from labapp.simulation.torch import Torch
 from labapp.system import interrupts_blocked
 
@@ -63,20 +63,12 @@ class TruePool(PoolSurface, Protocol):
 
 
 @dataclass(frozen=True)
-class RecordedFrame(ReadOnlyArrays):
-    """A rendered frame and its ground truth."""
+class RecordedFrame(RenderedFrame):
+    """A rendered frame, perhaps the sum of several exposures, and its ground truth."""
 
     pool: TruePool
     reflections: Reflections
     """The ground truth, in the middle of the exposure."""
-    image: Picture
-    """Grey levels, shape (height, width), 8 bit; 16 bit if exposures were added up or the look has
-    more bits.
-    """
-    dot_px: FloatArray
-    """(u, v) of each ray's dot, shape (rows, columns, 2), px; NaN if the ray has no dot."""
-    shown: BoolArray
-    """Rays whose dot is in the picture, shape (rows, columns)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +116,7 @@ class Recording:
         image = exposed[0].image
         if self.exposures > 1:
             image = np.sum([one.image for one in exposed], axis=0, dtype=np.uint16)
-        return RecordedFrame(self.pools[index], middle, image, exposed[0].dot_px, exposed[0].shown)
+        return RecordedFrame(image, exposed[0].dot_px, exposed[0].shown, self.pools[index], middle)
 
     def calibration_picture(self) -> GreyImage:
         """Render the calibration picture, grey levels, shape (height, width)."""

@@ -64,7 +64,7 @@ class RenderedFrame(ReadOnlyArrays):
     """A rendered frame and its dots."""
 
     image: Picture
-    """Shape (height, width), 8 bit, or 16 if the look has more than 8 bits."""
+    """Shape (height, width), 8 bit, or 16 if the look has more or exposures were added up."""
     dot_px: FloatArray
     """(u, v) of each ray's dot, in the picture or not, shape (rows, columns, 2), px: the mean
     position over the exposure if it moves; NaN if the ray has no dot.
