@@ -177,12 +177,16 @@ class Workspace(QObject):
         cause: str = "",
         beside: Callable[[str], object] | None = None,
     ) -> bool:
-        """Change the session and emit `changed`; report an error and return False if it fails."""
+        """Change the session; report an error and return False if it fails.
+
+        `changed` is emitted either way: fields must not go on showing what was refused.
+        """
         session = self.session
-        if session is None or self.run_or_report(lambda: (change(session),), cause, beside) is None:
+        if session is None:
             return False
+        done = self.run_or_report(lambda: (change(session),), cause, beside) is not None
         self.changed.emit()
-        return True
+        return done
 
     def undo(self) -> None:
         """Undo the last change."""

@@ -23,6 +23,7 @@ from PySide6.QtWidgets import (
 )
 from pytestqt.qtbot import QtBot
 
+from labapp.errors import InputError
 from labapp.export.heights import profile, sigma_at
 from labapp.export.rendering.paper import Paper
 from labapp.export.rendering.scene import DIFFERENCE_MAP
@@ -95,6 +96,16 @@ def test_choice_of_scheme_can_be_undone(page: SurfacePage) -> None:
     page.workspace.undo()
     assert page.side.scheme.value() == "fit"
     assert page.view.scene is not None
+
+
+def test_refused_scheme_is_not_shown(page: SurfacePage, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise InputError("a.labsession", "file", "no space left", "enough of it")
+
+    monkeypatch.setattr(Session, "set_settings", full)
+    page.side.scheme.set_value("ers")
+    page.side.scheme.edited.emit("ers")
+    assert page.side.scheme.value() == "fit"  # the figures below are of this one
 
 
 def test_outdated_frame_can_be_measured_again(page: SurfacePage, qtbot: QtBot) -> None:

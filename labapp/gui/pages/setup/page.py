@@ -57,6 +57,7 @@ class SetupPage(Page):
         self.steps: dict[str, QCheckBox] = {}
         self._times: dict[str, QLabel] = {}
         self._drawn: object = None
+        self._recorded: object = None
         self.tabs = QTabWidget()
         self.tabs.tabBar().setAccessibleName("Parts of the set-up")
         safety, preparation = self._list(self.ticks, SAFETY), QWidget()
@@ -104,8 +105,12 @@ class SetupPage(Page):
         self.travel.set_value(shown.travel)
         self.status.setText(shown.status)
         self.sigma_words.setText(shown.sigma_words)
+        recorded = (session.path, shown.record)
         for name, noted in self.record_fields.items():
-            noted.set_value(getattr(shown.record, name))
+            # A text that could not be stored stays: it took long to type.
+            if recorded != self._recorded or isinstance(noted, NumberField):
+                noted.set_value(getattr(shown.record, name))
+        self._recorded = recorded
         times = dict(ticked(shown.record))
         for item, box in (self.ticks | self.steps).items():
             box.setChecked(item in times)
@@ -193,10 +198,9 @@ class SetupPage(Page):
 
     def _tick(self, item: str, on: bool) -> None:
         now = datetime.now().astimezone().isoformat(timespec="seconds")
-        if not self.workspace.attempt(
+        self.workspace.attempt(
             lambda session: session.set_record(tick(session.record, item, on, now))
-        ):
-            (self.ticks | self.steps)[item].setChecked(not on)
+        )
 
     def _bench(self) -> QWidget:
         load = button("Load…", "Take all of the set-up from a setup file (TOML)", self._choose_load)
