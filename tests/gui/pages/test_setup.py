@@ -20,9 +20,11 @@ from labapp.config.setup_keys import SECTIONS
 from labapp.core.geometry.line_pattern import LinePattern, LineRays
 from labapp.core.geometry.rig import DotPattern
 from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, POINTS, QUANTITIES
+from labapp.errors import InputError
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.page import SetupPage
 from labapp.gui.pages.setup.presenter import RIG
+from labapp.gui.tasks import PROBLEM
 from labapp.gui.views.drawings.bench import DRAWN
 from labapp.gui.views.drawings.pattern import PatternView
 from labapp.gui.workspace import Workspace
@@ -400,6 +402,38 @@ def test_setup_file_is_loaded_and_saved(page: SetupPage, tmp_path: Path) -> None
     assert session.setup_text == before
     page.save(tmp_path / "not there" / "out.toml")
     assert "can be written" in page.answer.text()
+
+
+def test_setup_for_larger_frames_is_reported(page: SetupPage, tmp_path: Path) -> None:
+    session = page.workspace.session
+    assert session is not None
+    page.save(tmp_path / "out.toml")
+    small = tmp_path / "small.npy"
+    np.save(small, np.zeros((1, 320, 240), np.uint8))
+    page.workspace.show(Session.create(tmp_path / "small.labsession"))
+    page.session.import_recording(small)
+    page.load(tmp_path / "out.toml")
+    assert page.answer.text().startswith(PROBLEM)
+    assert "frames have 240×320 px" in page.answer.text()
+
+
+def test_refused_number_is_not_shown_and_refused_text_stays(
+    qtbot: QtBot, page: SetupPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise InputError("a.labsession", "file", "no space left", "enough of it")
+
+    field, notes = page.rig_fields["laser.distance_mm"], page.record_fields["operator"]
+    stored = field.value()
+    monkeypatch.setattr(Session, "update_setup", full)
+    retype(qtbot, field, "33")
+    assert field.value() == stored
+    monkeypatch.setattr(Session, "set_record", full)
+    retype(qtbot, notes, "Ada")
+    box = page.ticks[SAFETY[0][0]]
+    box.click()
+    assert not box.isChecked()
+    assert notes.value() == "Ada"  # what took long to type can be entered again
 
 
 def test_every_control_has_a_name_and_a_tooltip(page: SetupPage) -> None:

@@ -50,6 +50,11 @@ def _nothing() -> None:
     pass
 
 
+def _warnings(session: Session, recording: Recording) -> tuple[str, ...]:
+    """Warnings about a recording, and about its size if the set-up is for another one."""
+    return (*recording.warnings, *filter(None, [size_warning(session, recording)]))
+
+
 class CapturePage(Page):
     """Choice, import and live capture of the recording."""
 
@@ -195,9 +200,7 @@ class CapturePage(Page):
         for row, (name, words) in enumerate(rows):
             self.facts.addWidget(plain_label(f"{name}:"), row, 0)
             self.facts.addWidget(selectable_label(words), row, 1)
-        unlike = size_warning(session, recording)
-        warnings = (*recording.warnings, *[unlike] * bool(unlike))
-        for row, sentence in enumerate(warnings, len(rows)):
+        for row, sentence in enumerate(_warnings(session, recording), len(rows)):
             self.facts.addWidget(selectable_label(f"⚠ {sentence}"), row, 0, 1, 2)
 
     def _show_import(self) -> None:
@@ -356,7 +359,8 @@ class CapturePage(Page):
                 self.workspace.show_frame(frames[0])
             self._seen = None
             message = f"{pluralize(len(frames), 'frame')} of {path.name} imported"
-            self.confirm(f"{message}. {' '.join(recording.warnings)}".strip())
+            warnings = (f"⚠ {sentence}" for sentence in _warnings(session, recording))
+            self.confirm(" ".join((f"{message}.", *warnings)))
             self.workspace.changed.emit()
             then()
 
