@@ -16,6 +16,7 @@ from labapp.gui.pages.laser import presenter
 from labapp.gui.pages.laser.page import LaserPage
 from labapp.gui.pages.laser.presenter import ENDS, SCALE, Readings
 from labapp.gui.shell.steps import states
+from labapp.gui.tasks import DONE
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT
@@ -165,7 +166,13 @@ def test_typed_readings_are_applied_and_undone(qtbot: QtBot, page: LaserPage) ->
     page.use_button.click()
     assert session.setup.rig.laser.distance_mm == pytest.approx(90.0, abs=0.01)
     assert page.readings().lengths_mm == CROSS
+    assert page.applied.text().startswith(DONE)
+    fill(page, 0, ("13,5",))
+    assert page.applied.text() == ""  # these readings are not in use
+    fill(page, 0, ("13,676",))
+    assert page.applied.text().startswith(DONE)
     page.workspace.undo()
+    assert page.applied.text() == ""
     assert (session.setup.rig.laser, page.readings()) == before
 
 

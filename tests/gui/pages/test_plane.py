@@ -24,6 +24,7 @@ from labapp.gui.pages.plane import page as plane_page_module
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.page import PlanePage
 from labapp.gui.shell.steps import calibrations_in_use, states
+from labapp.gui.tasks import DONE
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.simulation.calibration.board import board_svg
@@ -218,8 +219,42 @@ def test_target_is_found_applied_and_undone(qtbot: QtBot, page: PlanePage) -> No
     stored = session.plane_calibration
     assert stored is not None
     assert (stored.found, stored.unit_mm) == (placed, 6.35)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert page.applied.text().startswith(DONE)
     page.workspace.undo()
     assert session.setup_text == before
+
+
+def test_only_the_calibration_in_use_is_called_so(qtbot: QtBot, page: PlanePage) -> None:
+    page.load(GTAW / "calibration.png")
+    qtbot.waitUntil(lambda: page.found is not None and page.found.threshold > 0)
+    page.use()
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert page.applied.text().startswith(DONE)
+    page.unit.set_value(7.0)
+    page.unit.edited.emit(7.0)
+    assert page.applied.text() == ""
+    page.kept_button.click()
+    qtbot.waitUntil(lambda: page.applied.text().startswith(DONE))
+    page.load(GTAW / "not there.png")
+    qtbot.waitUntil(lambda: page.answer.text() != "")
+    assert page.applied.text().startswith(DONE)  # it is still the one that is shown
+    page.workspace.attempt(
+        lambda session: session.update_setup({"image_calibration": {"x_axis_mm": 50.0}})
+    )
+    assert page.applied.text() == ""
+
+
+def test_picture_of_another_size_than_the_frames_is_reported(
+    qtbot: QtBot, page: PlanePage, tmp_path: Path
+) -> None:
+    assert page.words.text() == ""
+    image = cv2.imread(str(GTAW / "calibration.png"), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    cv2.imwrite(str(tmp_path / "high.png"), np.pad(image, ((10, 10), (0, 0)), mode="edge"))
+    page.load(tmp_path / "high.png")
+    qtbot.waitUntil(lambda: "480×660 px, and frames have 480×640 px" in page.words.text())
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
 
 
 def test_only_one_search_runs_and_it_replaces_no_dragged_point(

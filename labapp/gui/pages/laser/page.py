@@ -13,6 +13,7 @@ from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.laser import presenter
 from labapp.gui.pages.laser.presenter import ENDS, MEANINGS, NAMES, SCALE, Place, Readings
 from labapp.gui.pages.page import Page
+from labapp.gui.tasks import DONE
 from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.drawings.cross_hair import CrossHairView
 from labapp.gui.views.picture import PictureView
@@ -28,6 +29,8 @@ from labapp.media import GreyImage, read_picture
 WAYS = (("callipers", "by callipers"), ("picture", "from a picture"))
 
 DRAWN_WORDS = "To scale: the beam, the edges of the fan, and the cross on the work piece."
+
+IN_USE = f"{DONE} In the set-up"
 
 SEVERAL = "The mean of several readings: change them in the table"
 
@@ -118,7 +121,8 @@ class LaserPage(Page):
         if self.workspace.attempt(
             lambda session: session.calibrate_laser(*lengths_mm, fan_deg, picture, settings)
         ):
-            self.confirm("Applied to the set-up; undo restores the former laser", self.applied)
+            words = "Applied to the set-up; undo restores the former laser"
+            self.workspace.notified.emit(words, False)
 
     # --- the panel --------------------------------------------------------------------------
 
@@ -246,6 +250,7 @@ class LaserPage(Page):
         why_not = result.why_not or self.locked
         tip = "Put angle and distance into the set-up; undo restores the former ones"
         allow(self.use_button, tip, why_not)
+        self.applied.setText(IN_USE if presenter.is_in_use(self.session, readings) else "")
         example = f"{result.why_not}. The drawing shows an example"
         words = example if result.found is None else DRAWN_WORDS
         self.drawing.show_laser(*presenter.drawn(readings, result.found), words)

@@ -113,6 +113,11 @@ def kept(session: Session) -> Readings | None:
     return Readings(lengths, calibration.fan_angle_deg, settings)
 
 
+def is_in_use(session: Session, readings: Readings) -> bool:
+    """Whether the set-up contains the laser of these readings."""
+    return kept(session) == readings and calibrations_in_use(session)[0]
+
+
 def result(readings: Readings) -> LaserResult:
     """The laser computed from readings, or the reason why it cannot be."""
     spread = tuple(

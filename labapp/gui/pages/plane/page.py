@@ -19,7 +19,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.presenter import POINTS
 from labapp.gui.shell.steps import Lead, Offer
-from labapp.gui.tasks import Task
+from labapp.gui.tasks import DONE, Task
 from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
@@ -36,6 +36,8 @@ NO_PICTURE = (
     "Load a picture of the target, or of a board, in the imaging plane, taken by the camera in its "
     "place."
 )
+
+IN_USE = f"{DONE} This calibration is in use"
 
 ADD = "A further picture of the same board, tilted or nearer to a corner of the picture"
 
@@ -151,7 +153,8 @@ class PlanePage(Page):
         if self.workspace.attempt(
             lambda session: session.use_plane(found, unit, image, self._name)
         ):
-            self.confirm("The calibration is in use; undo restores the former one", self.applied)
+            words = "The calibration is in use; undo restores the former one"
+            self.workspace.notified.emit(words, False)
 
     def lead(self, found: Lead | None) -> Lead | None:
         """Sources of a picture while there is none."""
@@ -358,11 +361,13 @@ class PlanePage(Page):
         self.square.setEnabled(is_board and not self.locked)
         self.add_button.setEnabled(is_board and not self.locked)
         self.add_button.setToolTip(ADD if is_board else f"{ADD}: load the one in the plane first")
+        self.applied.setText(IN_USE if presenter.is_in_use(self.session, self.found) else "")
         self._show_residuals()
         self.result.set_rows(result.rows)
         self.result.setVisible(bool(result.rows))
         why_not = (result.why_not,) if result.why_not else ()
-        parts = (f"⚠ {words}" for words in (*why_not, *result.warnings))
+        unlike = presenter.size_warnings(self.session, self.view.picture)
+        parts = (f"⚠ {words}" for words in (*why_not, *result.warnings, *unlike))
         show_words(self.words, "\n".join(parts))
         unusable = result.why_not or self.locked
         tip = "Measure with this calibration; undo restores the former one"

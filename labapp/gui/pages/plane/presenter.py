@@ -258,6 +258,26 @@ def residual_map(found: Calibration | None, height_px: int) -> ResidualMap | Non
     return ResidualMap(begin, begin + times * residual, length / longest, words)
 
 
+def size_warnings(session: Session, picture: GreyImage | None) -> tuple[str, ...]:
+    """Warning if frames of the session have another size than a picture, else empty."""
+    recording = session.recording
+    if picture is None or recording is None:
+        return ()
+    (rows, columns), frame = picture.shape, (recording.rows, recording.columns)
+    if (rows, columns) == frame:
+        return ()
+    return (
+        f"The picture has {columns}×{rows} px, and frames have {frame[1]}×{frame[0]} px: "
+        "they cannot be measured with it",
+    )
+
+
+def is_in_use(session: Session, found: Calibration | None) -> bool:
+    """Whether the set-up contains this calibration."""
+    kept = session.plane_calibration
+    return kept is not None and kept.found == found and calibrations_in_use(session)[1]
+
+
 def in_use(session: Session) -> tuple[ResultRow, ...]:
     """Scales and angle of the image calibration in the set-up."""
     names = (("Scale along X′", "px/mm"), ("Scale along Z′", "px/mm"), ("Angle", "°"))
