@@ -204,6 +204,17 @@ def test_choosing_previewing_and_importing(page: CapturePage, stack: Path, qtbot
     assert page.state(NOTHING) is NOTHING
 
 
+def test_no_frame_after_the_last_can_be_chosen(
+    page: CapturePage, stack: Path, qtbot: QtBot
+) -> None:
+    np.save(stack, np.zeros((1, 40, 50), np.uint8))
+    page.take(stack)
+    qtbot.waitUntil(lambda: page.preview is not None)
+    for field, fewest in ((page.chosen.first, 0), (page.chosen.last, 0), (page.chosen.every, 1)):
+        assert (field.lowest, field.highest) == (fewest, fewest)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+
+
 def test_the_recording_chosen_last_is_previewed(
     page: CapturePage, stack: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -373,10 +384,13 @@ def test_frame_size_other_than_calibrated_is_reported(
 
     qtbot.waitUntil(lambda: "recording.tif" in facts())
     assert "calibrated with" not in facts()
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     half = tmp_path / "half.npy"
     np.save(half, np.zeros((2, 240, 460), np.uint8))
-    session.import_recording(half)
-    window.workspace.changed.emit()
+    page.take(half)
+    qtbot.waitUntil(lambda: page.preview is not None)
+    page.import_chosen()
+    qtbot.waitUntil(lambda: "frames have 460×240 px" in page.answer.text())
     qtbot.waitUntil(lambda: "a picture of 460×480 px, and frames have 460×240 px" in facts())
     # A calibration that is not in use is not compared.
     point = {"image_calibration": {"origin_px": [1.0, 2.0]}}

@@ -79,7 +79,7 @@ class ImportChoice(Group):
         """Start with all frames of a recording."""
         last = preview.frames - 1
         for field, value in ((self.first, 0), (self.last, last), (self.every, 1)):
-            field.highest = max(1, last)
+            field.highest = max(field.lowest, last)
             field.set_value(value)
         self.rate.set_value(None)
         message = "\n".join([preview.description, *(f"⚠ {each}" for each in preview.warnings)])
