@@ -62,6 +62,7 @@ def test_pictures_of_frames_have_the_chosen_format(gtaw: Path, tmp_path: Path, s
         written = write(session, request, [0], tmp_path / "out", lambda *_: None)
         rows, columns = session.frame(0).image.shape
     (picture,) = written.files
+    assert written.words.startswith("1 file and the manifest")
     assert picture.name == f"frame_000000.{suffix}"
     image = cv2.imread(str(tmp_path / "out" / picture.name))
     assert image.shape == (3 * rows, 3 * columns, 3)
@@ -90,6 +91,8 @@ def test_plan_lists_files_and_frames(gtaw: Path) -> None:
         assert plan(session, ExportRequest(which="view"), 3).frames.tolist() == [3]
         part = plan(session, ExportRequest(which="part", first=4, last=11, every=3), 0)
         assert part.frames.tolist() == [4, 7, 10]
+        none = plan(session, ExportRequest(which="part", first=20, last=3), 0)
+        assert none.why_not == "There is no frame from 20 to 3."
         assert plan(session, ExportRequest(ticked=frozenset()), 0).why_not.startswith("Tick what")
         assert "measure them first" in plan(session, ExportRequest(scheme="ers"), 0).why_not
         assert schemes(session) == (("", "fit (as in the settings)"),)

@@ -237,7 +237,9 @@ def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
         scheme=scheme,
         frames=frames,
         again=np.asarray(again, np.int64),
-        why_not=_why_not(session, request, scheme, frames, stale),
+        why_not=_why_not(session, request, scheme, frames, stale)
+        if chosen.any() or not len(chosen)
+        else f"There is no frame from {request.first} to {request.last}.",
         locked=locked,
         notes=tuple(filter(None, notes)),
         files=(*files, MANIFEST_LINE) if len(frames) else (),
@@ -368,7 +370,8 @@ class Written:
     def words(self) -> str:
         """Text for the operator."""
         size = format_bytes(sum(file.size for file in self.files))
-        message = f"{len(self.files)} files and the manifest, {size}, are in {self.folder}."
+        files = pluralize(len(self.files), "file")
+        message = f"{files} and the manifest, {size}, are in {self.folder}."
         if not self.problems:
             return f"{message} Verified against the manifest."
         shown = "; ".join(self.problems[:SHOWN_PROBLEMS])
