@@ -219,7 +219,7 @@ def spectrum(course: Trend) -> Spectrum:
     Raises
     ------
     ValueError
-        If the run is too short.
+        If the run is too short, or all its values are the same.
     """
     members = _even_part(course)
     count = len(members)
@@ -228,6 +228,8 @@ def spectrum(course: Trend) -> Spectrum:
             f"a spectrum needs {FEWEST} frames in a row, evenly spaced in time; "
             f"there are {count} at most",
         )
+    if np.ptp(course.value[members]) == 0:
+        raise ValueError("there is no oscillation: the value is the same in all frames")
     from scipy.signal import detrend  # a slow import, not needed at the app's start
     from scipy.signal.windows import hann
 

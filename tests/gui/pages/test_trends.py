@@ -75,6 +75,9 @@ def test_spectrum_is_shown_or_its_absence_explained(gtaw: Path, copy_sample) -> 
         assert len(shown.spectrum[0].x) == 15
         assert shown.spectrum_axis.unit == "Hz"
         assert shown.spectrum_words.startswith("Strongest at 2.0 Hz: 0.025 mm. Frames 0 to 29 (30)")
+        flat = show(session, TrendOptions(spectrum_of="depth_mm"))  # 0 in all frames
+        assert flat.spectrum == ()
+        assert flat.spectrum_words.startswith("There is no oscillation")
     with Session.open(copy_sample("concave")) as session:
         shown = show(session, TrendOptions(spectrum_of="depth_mm"))
         assert shown.spectrum == ()
