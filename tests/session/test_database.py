@@ -156,6 +156,17 @@ def test_second_writer_is_rejected_but_can_read(path: Path):
     Database.open(path).close()
 
 
+def test_second_writer_through_a_link_is_rejected(path: Path, tmp_path: Path):
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "elsewhere" / "link.labsession"
+    link.symlink_to(path)
+    first = Database.open(link)
+    with pytest.raises(SessionInUse):
+        Database.open(path)
+    first.close()
+    Database.open(path).close()
+
+
 def test_lock_of_a_killed_process_is_released(path: Path):
     script = (
         "import os, sys; from labapp.session.file.database import Database; "

@@ -391,6 +391,7 @@ def _apply_migrations(file: Path, version: int, path: Path, end: str = "COMMIT")
 
 def _lock(path: Path) -> FileLock:
     """Lock the session for writing; the operating system releases the lock with the process."""
+    path = Path(os.path.realpath(path))  # one lock for a file, and for links to it
     lock = FileLock(path.with_name(f".{path.name}.lock"))
     try:
         if not path.parent.is_dir():
