@@ -730,6 +730,20 @@ def test_frame_without_dots_shows_the_reason(
     assert result.measurement.reason[1:] in page.dots_panel.seen.text()
 
 
+def test_all_dots_can_be_deleted_and_restored(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    show(page, qtbot, copy_sample("blocked_rows"), 0)
+    before = len(page.editor.dots_px)
+    key(page, Qt.Key.Key_A, Qt.KeyboardModifier.ControlModifier)
+    key(page, Qt.Key.Key_Delete)
+    # The detector is not used in a frame that is corrected by hand.
+    assert presenter.NO_DOTS not in page.dots_panel.seen.text()
+    assert "Back to automatic" in page.dots_panel.seen.text()
+    page.workspace.undo()
+    assert len(page.editor.dots_px) == before
+
+
 def test_cancelled_detection_looks_for_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     control = Control()
     monkeypatch.setattr(presenter, "find_dots", lambda *_: control.cancelled.set())

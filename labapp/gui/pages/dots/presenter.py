@@ -28,6 +28,8 @@ NO_PLACES: FloatArray = np.zeros((0, 2))
 
 NO_DOTS = "Lower the detector's threshold below, add dots, or record with more light."
 
+NO_DOTS_LEFT = "Add dots, or press Back to automatic."
+
 Origin = Literal["corrected", "measured", "found", "looked for"]
 
 
@@ -197,7 +199,7 @@ def sentence(seen: DotsState) -> str:
         "looked for": "",
     }[seen.origin]
     if not len(dots):
-        return f"{message}: no dots. {NO_DOTS}"
+        return f"{message}: no dots. {NO_DOTS_LEFT if seen.origin == 'corrected' else NO_DOTS}"
     words = f"{message}: {pluralize(len(dots), 'dot')} in {pluralize(rows, 'row')}"
     words += f", {doubtful} in doubt" if doubtful else ", none in doubt"
     if lattice.reference is None:
