@@ -221,6 +221,8 @@ class LiveView(QObject):
         live, self.live = self.live, None
         if live is None:
             return
+        if self._opening is not None:
+            self._opening.cancel()  # otherwise a simulated pool would still be rendered
         self._timer.stop()
         self._rings.hide()
         if live.watch is not None:

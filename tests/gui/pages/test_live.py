@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import threading
+import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -666,6 +667,30 @@ def test_opening_a_camera_can_be_cancelled(
     qtbot.waitUntil(lambda: page.live_view.live is None)
     assert page.live_view.start_button.isVisible()
     assert page.camera is None
+
+
+def test_choosing_a_file_ends_the_opening_of_a_camera(
+    page: CapturePage, tmp_path: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    started, ended = threading.Event(), threading.Event()
+
+    def slow(_text: str, progress: Callable[[int, int], None]) -> None:
+        started.set()
+        try:
+            for done in range(round(PATIENCE_S * 100)):
+                progress(done, 0)
+                time.sleep(0.01)
+        finally:
+            ended.set()
+
+    monkeypatch.setattr(live_view, "pool_camera", slow)
+    page.live_view.start()
+    qtbot.waitUntil(started.is_set)
+    np.save(tmp_path / "stack.npy", np.zeros((3, 20, 30), np.uint8))
+    page.take(tmp_path / "stack.npy")
+    qtbot.waitUntil(lambda: page.preview is not None)
+    assert ended.wait(1.0)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
 
 
 def test_found_cameras_can_be_chosen(
