@@ -159,6 +159,7 @@ def test_damaged_results_are_rejected(
         ("--of", "shade_mm"),
         ("--band", "9:3"),
         ("--band", "9:inf"),
+        ("--band", "30:900"),
         ("--segment", "0.01"),
         ("--start", "1"),
         ("--film", "(9,9)"),

@@ -84,7 +84,7 @@ def dynamics_of(
     Raises
     ------
     InputError
-        If there are too few frames, or a name or the segment is invalid.
+        If there are too few frames, or a name, the band or the segment is invalid.
     """
     chosen = settings or DynamicsSettings()
     if chosen.of not in WITH_SIGMA:
@@ -103,6 +103,11 @@ def dynamics_of(
             yield frame, time_s, surface, boundary
 
     surfaces = SurfaceSeries.of(collected())
+    if chosen.band_hz is not None and len(surfaces.time_s) > 1:
+        low, half = chosen.band_hz[0], 0.5 / float(np.median(np.diff(surfaces.time_s)))
+        if low > half * (1 - 1e-6):
+            allowed = f"frequencies up to {half:.4g} Hz, half the frame rate"
+            raise InputError("dynamics", "band_hz", f"from {low:g} Hz", allowed)
     series = dict(zip(WITH_SIGMA, np.array(rows).reshape(-1, len(WITH_SIGMA)).T, strict=True))
     highest = max(np.max(np.abs([series["height_mm"], series["depth_mm"]]), initial=0), 1e-9)
     setup, *level = (

@@ -130,3 +130,14 @@ def test_noise_alone_has_no_oscillation():
     time = np.arange(200) / 200
     counts = [len(fit_oscillations(time, rng.normal(size=200))) for _ in range(30)]
     assert sum(counts) <= 1
+
+
+@pytest.mark.parametrize("hertz", [29.9, 30.0])
+def test_no_alias_beyond_half_the_frame_rate_is_found(hertz):
+    rng = np.random.default_rng(1)
+    time = np.arange(120) / 60
+    value = np.cos(2 * np.pi * hertz * time + 0.7) + rng.normal(0, 0.05, 120)
+    found = [one.frequency_hz for one in fit_oscillations(time, value, 1, (5.0, 500.0))]
+    assert found == pytest.approx([hertz] if hertz < 30 else [], abs=0.02)
+    for nothing in ((30.0, 500.0), (10.03, 10.12)):  # narrower than the frequencies searched
+        assert fit_oscillations(time, value, 1, nothing) == ()

@@ -107,15 +107,19 @@ def fit_oscillations(
     most
         Largest number of oscillations; at most one for every `FEWEST` samples.
     band_hz
-        Lowest and highest frequency. None: from two periods in the series to half the frame rate.
+        Lowest and highest frequency, at most half the frame rate. None: from two periods in the
+        series to half the frame rate.
     """
     time = np.asarray(time_s, float) - time_s[0]
     value = np.asarray(values, float).reshape(len(time), -1)
     if len(time) < FEWEST:
         return ()
     step = float(np.median(np.diff(time)))
-    band = band_hz or (2 / (time[-1] + step), 0.5 / step)
+    low, high = band_hz or (2 / (time[-1] + step), np.inf)
+    band = low, min(high, 0.5 / step)  # beyond, every frequency fits as well as its alias
     edge = 0.05 / (time[-1] + step)  # a maximum at an end of the band lies outside it
+    if band[1] - low < 2 * edge:
+        return ()
     fitted = _Fit(time, value, np.empty((0, 2)))
     while len(fitted.rates) < min(most, len(time) // FEWEST):
         start = 2 * np.pi * _strongest(time, fitted.residual, step, band)
@@ -199,7 +203,7 @@ def _strongest(
     power = np.sum(np.abs(np.fft.rfft(even, size, axis=0)) ** 2, axis=1)
     frequency = np.fft.rfftfreq(size, step)
     power[(frequency < band[0]) | (frequency > band[1])] = 0
-    return float(frequency[np.argmax(power)])
+    return float(np.clip(frequency[np.argmax(power)], *band))  # a narrow band has no frequency
 
 
 def _refine(
