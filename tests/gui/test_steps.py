@@ -11,7 +11,7 @@ from labapp.config.setup import parse_setup
 from labapp.errors import InputError
 from labapp.gui.shell.steps import STEPS, Mark, setup_to_do, states
 from labapp.session.session import Session
-from tests.gui.conftest import SAMPLES
+from tests.gui.conftest import SAMPLES, CopySample
 
 LASER = "[laser]\nprojection_angle_deg = 31.14\ndistance_mm = 31.48\n"
 PATTERN = "[pattern]\nrows = 19\ncolumns = 19\ninter_beam_angle_deg = 0.77\n"
@@ -62,6 +62,13 @@ def test_states_of_a_new_session(tmp_path: Path) -> None:
         == ("Not calibrated yet, and no values were entered")
     )
     assert setup_to_do(()) == ""
+
+
+def test_doubtful_setup_needs_attention(copy_sample: CopySample) -> None:
+    with Session.open(copy_sample("gtaw")) as session:
+        assert states(session)["setup"].mark is Mark.DONE
+        session.update_setup({"laser": {"projection_angle_deg": 89.0}})
+        assert states(session)["setup"].mark is Mark.ATTENTION
 
 
 def test_line_pattern_renames_the_dots_step(tmp_path: Path) -> None:

@@ -193,8 +193,13 @@ def _facts(session: Session, seen: Overview | None) -> Facts:
 
 
 def _setup(facts: Facts) -> State:
-    to_do = facts.to_do
-    return State(Mark.READY, to_do) if to_do else State(Mark.DONE, "Complete")
+    from labapp.core.recording.residual_check import DOUBTFUL
+
+    if facts.to_do:
+        return State(Mark.READY, facts.to_do)
+    if facts.session.setup_status == DOUBTFUL:
+        return State(Mark.ATTENTION, "Complete, but doubtful: see the tab Bench")
+    return State(Mark.DONE, "Complete")
 
 
 def _laser(facts: Facts) -> State:
@@ -469,7 +474,7 @@ def first_step(session: Session) -> str:
         if "followed" in measured and "ok" not in measured:
             return "trends"  # a single line is tracked, but gives no surface
         return "surface" if measured else "dots"
-    return "capture" if states(session)["setup"].why == "Complete" else "setup"
+    return "capture" if states(session)["setup"].mark is Mark.DONE else "setup"
 
 
 def first_frame(session: Session) -> int | None:
