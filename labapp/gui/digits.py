@@ -48,6 +48,8 @@ def entered(value: float, decimals: int) -> str:
 
 def parsed(entry: str) -> float | None:
     """The entered number, with a decimal point or comma; None if it is not a finite number."""
+    if "_" in entry:  # Python would read 1_0 as 10
+        return None
     try:
         value = float(entry.strip().replace(MINUS, "-").replace(",", "."))
     except ValueError:

@@ -44,7 +44,7 @@ def test_typed_numbers_are_shown_in_full_and_computed_ones_rounded():
 def test_numbers_accept_point_or_comma_and_either_minus():
     assert parsed(" 27,5 ") == parsed("27.5") == 27.5
     assert parsed("−3") == -3
-    for text in ("", "x", "1 2", "nan", "inf"):
+    for text in ("", "x", "1 2", "1_0", "nan", "inf"):
         assert parsed(text) is None
 
 
