@@ -102,6 +102,8 @@ def test_current_is_limited_to_the_time_of_the_recording(gtaw: Path, copy_sample
         shown = show(session, TrendOptions())
         assert "None of it falls into" in shown.signals_words
         assert len(shown.curves) == 4
+        session.set_signals(Signals("a.csv", np.zeros(1), np.zeros(1), np.zeros(1), 0.0))
+        assert "1 sample," in show(session, TrendOptions()).signals_words
     with Session.open(copy_sample("concave")) as session:
         session.set_signals(logged())
         assert "no time base" in show(session, TrendOptions()).signals_words

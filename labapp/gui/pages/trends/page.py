@@ -24,6 +24,7 @@ from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.results.trends import QUANTITIES
 from labapp.session.signals import Signals, read_signals
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.steps import Event
@@ -180,7 +181,7 @@ class TrendsPage(Page):
             return found
 
         def done(kept: Signals) -> None:
-            self.confirm(f"{kept.file}: {len(kept.time_s)} samples")
+            self.confirm(f"{kept.file}: {pluralize(len(kept.time_s), 'sample')}")
             self.workspace.changed.emit()
 
         self.start_task(title, work, done, kind="Reading current and voltage")

@@ -336,7 +336,8 @@ def _told_signals(signals: Signals | None, seen: Overview, timed: bool) -> str:
             "shown along."
         )
     ends = signals.time_s[[0, -1]] + signals.start_s
-    message = f"{signals.file}: {len(signals.time_s)} samples, {ends[0]:.3f} … {ends[1]:.3f} s"
+    count = pluralize(len(signals.time_s), "sample")
+    message = f"{signals.file}: {count}, {ends[0]:.3f} … {ends[1]:.3f} s"
     if not timed:
         return f"{message}. Not shown: the recording has no time base; import it with a frame rate."
     low, high = float(seen.time_s.min()), float(seen.time_s.max())
