@@ -319,6 +319,8 @@ def test_empty_page_offers_the_next_action(
     assert window.empty.words.height() >= window.empty.words.heightForWidth(
         window.empty.words.width()
     )
+    hand.press(Qt.Key.Key_Tab)
+    assert window.focusWidget() is first
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 from PySide6.QtCore import QPointF, QRectF, Qt, Signal
@@ -48,6 +49,7 @@ class EmptyState(QWidget):
 
     def __init__(self) -> None:
         super().__init__()
+        self.setFocusPolicy(Qt.FocusPolicy.ClickFocus)  # otherwise it has no place in the tab order
         self._shown: tuple[str, Lead] | None = None
         self.picture = _Picture()
         self.words = wrapping_label()
@@ -77,6 +79,8 @@ class EmptyState(QWidget):
             made.setDefault(k == 0)
             made.setMinimumHeight(made.fontMetrics().height() * (2 if k == 0 else 1) + 8)
             self._column.addWidget(made)
+        for one, following in pairwise((self, *self.buttons)):
+            QWidget.setTabOrder(one, following)  # otherwise they come last in the window
 
     def _button(self, offer: str | Offer) -> QPushButton:
         if isinstance(offer, Offer):
