@@ -389,6 +389,25 @@ def test_editing_by_clicks_boxes_drags_and_keys(
     assert unfitted[0] == [0]
 
 
+def test_drag_that_outlasts_its_frame_moves_nothing(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    session = show(page, qtbot, copy_sample("blocked_rows"), 0)
+    messages: list[str] = []
+    page.workspace.notified.connect(lambda words, _: messages.append(words))
+    port, place, steps = page.view.canvas.viewport(), page.editor.dots_px[5], len(session.history)
+    QTest.mousePress(port, Qt.MouseButton.LeftButton, pos=at(page, *place))
+    for moved in (8, 16):
+        QTest.mouseMove(port, at(page, *place + moved))
+        let_draw()
+    assert page.editor.shift_px.any()
+    page.workspace.show_frame(1)
+    qtbot.waitUntil(lambda: page.reader.frame == 1 and page.editor.correction is not None)
+    QTest.mouseRelease(port, Qt.MouseButton.LeftButton, pos=at(page, *place + 16))
+    assert messages == []
+    assert len(session.history) == steps
+
+
 def test_rejected_edit_is_reported_and_changes_nothing(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:

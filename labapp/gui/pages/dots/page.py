@@ -517,7 +517,7 @@ class DotTool(Tool):
         self._page.overlay.hide_box()
         if self._boxing:
             self._page.choose(self._page.editor.box, start, (u, v), self._adds)
-        else:
+        elif len(self._page.editor.selection):  # not if another frame came into view meanwhile
             self._page.editor.shift_px[:] = u - start[0], v - start[1]
             self._page.editor.drop()
 
