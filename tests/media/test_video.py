@@ -4,6 +4,7 @@ import contextlib
 import gc
 import os
 import re
+import shutil
 import subprocess
 import sys
 import weakref
@@ -30,6 +31,7 @@ WriteVideo = Callable[[Path, Pictures, str], Path]
 Encode = Callable[..., Path]
 
 H264 = Path(__file__).parent / "data" / "h264.mp4"
+SAMPLE = Path(__file__).parents[2] / "sample_sessions" / "gtaw" / "recording.avi"
 VARYING = Path(__file__).parent / "data" / "varying_rate.mkv"
 GREY_16 = Path(__file__).parent / "data" / "grey16.mkv"
 
@@ -618,6 +620,17 @@ def test_invalid_video_is_rejected(
     with pytest.raises(InputError, match=r"recording_001\.avi: .*expected a video that FFmpeg"):
         open_source(path)
     assert capfd.readouterr() == ("", "")
+
+
+def test_video_that_is_overwritten_while_it_is_read_is_reported(tmp_path: Path) -> None:
+    path = tmp_path / "v.avi"
+    shutil.copyfile(SAMPLE, path)
+    with open_source(path) as source:
+        source.frame(0)
+        path.write_text("another file\n" * 10_000)
+        for index in (1, 20, 3, 3):
+            with pytest.raises(InputError):
+                source.frame(index)
 
 
 def test_video_without_a_complete_frame_is_rejected(

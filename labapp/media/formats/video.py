@@ -214,8 +214,9 @@ class VideoSource(FrameSource):
         self._continue_with(self._listed_packets())
 
     def _open(self) -> None:
+        opened = _open(self._path)  # if it was replaced, the present one stays open
         self._container.close()
-        self._container, self._stream = _open(self._path)
+        self._container, self._stream = opened
 
     def _continue_with(
         self, packets: Iterator[tuple[int, Packet[VideoStream]]], *, from_start: bool = True
