@@ -80,8 +80,11 @@ def write_view_film(
     Raises
     ------
     InputError
-        If a result is stale, nothing was measured, or the film cannot be drawn or written.
+        If the pattern is of lines, a result is stale, nothing was measured, or the film cannot be
+        drawn or written.
     """
+    if session.has_lines:
+        raise InputError(session.path, "film", "the session is of lines", "a pattern of dots")
     scheme = scheme_name(session.settings)
     numbers = _current_frames(session, scheme, None)
     measured, extent = _Measured(session, scheme, numbers), Extent()

@@ -290,6 +290,21 @@ def test_shortcut_saves_the_picture(
     assert QImage(chosen).width() == PaperDialog.paper.width_px
 
 
+def test_lines_are_neither_compared_nor_filmed(
+    page: SurfacePage, copy_sample: CopySample, tmp_path: Path, qtbot: QtBot
+) -> None:
+    page.comparing.click()
+    page.workspace.show(Session.open(copy_sample("five_lines")))
+    assert page.stack.currentWidget() is not page.compare
+    assert not page.comparing.isChecked()
+    assert not page.comparing.isEnabled()
+    assert not page.film.isEnabled()
+    page.write_film(tmp_path / "lines.mp4")  # from the menu of the view
+    qtbot.waitUntil(lambda: "is of lines" in page.saved.text())
+    page.workspace.show(Session.open(copy_sample("concave")))
+    assert page.comparing.isEnabled()
+
+
 @pytest.mark.usefixtures("opengl")
 def test_two_schemes_are_shown_side_by_side(page: SurfacePage, qtbot: QtBot) -> None:
     page.comparing.click()
