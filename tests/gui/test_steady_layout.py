@@ -20,6 +20,7 @@ from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages.dots.page import DotsPage
 from labapp.gui.pages.setup.page import BENCH_TAB, SAFETY_TAB
+from labapp.gui.shell.step_list import SidePanel
 from labapp.gui.shell.steps import STEPS
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.fields import Field
@@ -258,3 +259,12 @@ def test_panel_does_not_scroll_when_a_clicked_button_is_disabled(qtbot: QtBot) -
     QTest.keyClick(clicked, Qt.Key.Key_Tab)
     assert beyond.hasFocus()
     assert area.verticalScrollBar().value() > 0
+
+
+def test_side_panel_is_wider_with_a_larger_font(qtbot: QtBot) -> None:
+    panel = SidePanel()
+    KEPT.append(panel)
+    before, font = panel.sizeHint().width(), panel.font()
+    font.setPointSizeF(1.5 * font.pointSizeF())
+    panel.setFont(font)
+    assert panel.sizeHint().width() > 1.2 * before

@@ -196,8 +196,8 @@ class SidePanel(FollowsTheme, QWidget):
         self.follow_theme()
 
     def sizeHint(self) -> QSize:
-        """Width of two columns of numbers."""
-        return QSize(350, 500)
+        """Width of two columns of numbers: more with a larger font, as a table has names, too."""
+        return QSize(max(350, 42 * self.fontMetrics().horizontalAdvance("0")), 500)
 
     def show_panel(self, panel: QWidget, step: Step) -> None:
         """Show a page's panel."""
