@@ -116,20 +116,21 @@ def test_rows_found_with_another_setup_must_be_clearer() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "seed", "times"),
+    ("kind", "seed", "times", "status"),
     [
-        ("concave", 6902, 2.0),  # the right rows cost more at first, and less when they are grown
-        ("concave", 6911, 2.0),  # those of a hole three rows and columns away
-        ("egg", 8207, 1.0),  # a false dot at the absent ray makes them cost more
+        # The right rows cost more at first, and less when they are grown.
+        ("concave", 6902, 2.0, "ok"),
+        ("concave", 6911, 2.0, "ambiguous-rows"),  # those of a hole three rows and columns away
+        ("egg", 8207, 1.0, "ambiguous-rows"),  # a false dot at the absent ray makes them cost more
     ],
 )
 def test_no_rows_are_overlooked_if_the_setup_is_in_doubt(
-    kind: str, seed: int, times: float
+    kind: str, seed: int, times: float, status: str
 ) -> None:
     """Every label was wrong: the rows chosen cost less than all others that were compared."""
     rig, seen, pool = draw(kind, seed, 0.05, 12)
     got = measure_pool(pool, seen, with_setup_errors(rig, seed, times))
-    assert got.status == "ambiguous-rows"
+    assert (got.status, got.wrong) == (status, 0)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
-from labapp.core.matching import match_rays, repair
+from labapp.core.matching import match_rays, repair, unexplained
 from labapp.core.matching.hypothesis import Hypothesis, evaluate
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation
@@ -17,6 +17,7 @@ from labapp.core.matching.unexplained import explains, suffices
 from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice
 from labapp.core.values import IntArray
 from labapp.simulation.pools import egg
+from tests.benchmarks.dips import matched
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see, true_labels
 
 BENCH = Bench(BENCH_RIG, BENCH_VIEW)
@@ -91,6 +92,25 @@ def test_isolated_false_dots_do_not_prolong_the_search(monkeypatch: pytest.Monke
 
 def test_a_cluttered_frame_is_searched_in_other_ways(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(searched_with(seen_with(false=24), monkeypatch)) > 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_false_dots_apart_from_the_rows_are_accepted(seed: int) -> None:
+    """Once a frame with four false dots for ten labelled ones was refused."""
+    seen = see(POOL, np.random.default_rng(seed), sigma_px=0.05, missing=2, false=30)
+    match = matched(seen)
+    assert (seen.ray[match.dot] == match.ray).all()
+    assert len(match.dot) > 0.9 * np.sum(seen.ray[:, 0] > 0)
+
+
+def test_dots_between_labelled_rows_are_a_row() -> None:
+    seen = seen_with(false=0)
+    labels = true_labels(seen)
+    row = np.flatnonzero((labels != UNLABELLED).any(axis=1))[2]
+    labels[row:-1], labels[-1] = labels[row + 1 :], UNLABELLED
+    observed, found = hypothesis(seen, labels)
+    assert not unexplained._strays_lie_apart(observed, found)
 
 
 @pytest.fixture

@@ -75,6 +75,7 @@ from labapp.core.matching.repair import with_repaired, with_rows_beyond
 from labapp.core.matching.unexplained import (
     MOST_SCATTERED,
     MOST_SCATTERED_AT_LAST,
+    MOST_SCATTERED_OF_ALL,
     NOTHING_EXPLAINS,
     any_explains,
     explains_half,
@@ -230,7 +231,7 @@ def _decide_at_last(
             raise
         decided = _decide_with_other_setup(observed, found, lattice, settings)
         if decided is None:
-            raise
+            decided = _decide_among(observed, found, lattice, settings, MOST_SCATTERED_OF_ALL)
         return decided
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import scipy
 
 from labapp.core.matching.free_setup import SETUP_GAIN, with_setup_free
 from labapp.core.matching.hypothesis import KNOT_ERROR_MM, USUAL_FIT, Hypothesis
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation
-from labapp.core.values import CannotMeasure, median
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray
 
 FEW_LEFT = 0.05
 """A hypothesis explains a frame if at most this share of the dots is stray, and as few rays are
@@ -29,19 +28,21 @@ than 0.3 even if the set-up is slightly wrong, more than 1 if the labels are wro
 NOTHING_EXPLAINS = "no surface explains the reflected dots"
 """Reason for ``no-match`` if most of the dots have no ray."""
 
-PAIR, BESIDE_SPACINGS = 2, 1.5
-"""Up to this number of adjacent missed rays, or of adjacent stray dots, is not taken for a row.
-Dots are adjacent within `BESIDE_SPACINGS` spacings."""
+PAIR, ROW = 2, 5
+"""Up to so many adjacent missed rays are not taken for a row; so many adjacent stray dots are."""
 
-ROW, ROW_SPACINGS = 5, 2.2
-"""So many stray dots, each within `ROW_SPACINGS` spacings of the next, are a row: beyond the last
-labelled one, where rows fan out, dots are farther apart than the others."""
+BEYOND_STEPS, BETWEEN_STEPS = 0.45, 0.2
+"""A stray dot continues the labels within these distances of its expected place: beyond the last
+dot of a row or column, as a share of the last step; between two dots, as a share of their distance.
+Of the outermost dots of 240 pools, 1 % lie farther from where the next ones lead, 10 % beside a
+dent."""
 
-FEW_SCATTERED, MOST_SCATTERED, MOST_SCATTERED_AT_LAST = 0.2, 0.3, 0.38
+FEW_SCATTERED, MOST_SCATTERED, MOST_SCATTERED_AT_LAST, MOST_SCATTERED_OF_ALL = 0.2, 0.3, 0.38, 0.9
 """Largest share of stray dots and missed rays together, relative to the labelled dots, that is
 accepted if they are isolated: false dots and random failures are isolated, whereas the dots of a
 row that was omitted or skipped are not. The third applies when every kind of initial labels has
-been tried. With at most the first share no other kind is tried (`suffices`)."""
+been tried, the fourth when no likelier set-up explains more. With at most the first share no other
+kind is tried (`suffices`)."""
 
 MOST_MISSED_APART = 0.12
 """Largest share of isolated missed rays, relative to the labelled dots, with which a hypothesis
@@ -137,14 +138,47 @@ def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
 
 
 def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:
-    """Whether at most `PAIR` stray dots are adjacent, and fewer than `ROW` lie in a chain."""
-    dots = observed.plane_mm[hypothesis.labels[hypothesis.labels != UNLABELLED]]
-    spacing = median(scipy.spatial.cKDTree(dots).query(dots, k=2)[0][:, 1])
-    stray_dots = observed.plane_mm[hypothesis.stray_dots]
-    apart = scipy.spatial.distance.cdist(stray_dots, stray_dots)
-    beside = (apart <= BESIDE_SPACINGS * spacing).sum(axis=0)
-    chain = scipy.sparse.csgraph.connected_components(apart <= ROW_SPACINGS * spacing)[1]
-    return bool((beside <= PAIR).all() and (np.bincount(chain) < ROW).all())
+    """Whether fewer than `ROW` neighbouring stray dots continue the labelled rows and columns.
+
+    An omitted row lies where the labelled dots beside it lead, by equal steps or by steps that
+    change equally; a skipped one lies half-way between two labelled dots. False dots elsewhere are
+    not taken for a row, however many there are.
+    """
+    labelled = hypothesis.labels != UNLABELLED
+    place = np.full((*np.add(labelled.shape, 6), 2), np.nan)
+    place[3:-3, 3:-3][labelled] = observed.plane_mm[hypothesis.labels[labelled]]
+    for axis in (0, 1):  # the absent dot, or a missing one, does not divide a row
+        middle = (np.roll(place, 1, axis) + np.roll(place, -1, axis)) / 2
+        place = np.where(np.isnan(place), middle, place)
+    stray = observed.plane_mm[hypothesis.stray_dots]
+    beyond = np.zeros((*place.shape[:2], len(stray)), bool)
+    between = []
+    for axis in (0, 1):
+        for step in (1, -1):
+            last, second, third = (np.roll(place, by * step, axis) for by in (1, 2, 3))
+            radius = BEYOND_STEPS * (last - second)
+            beyond |= _near(stray, 2 * last - second, radius)
+            beyond |= _near(stray, 3 * (last - second) + third, radius)
+        after = np.roll(place, 1, axis)
+        between.append(_near(stray, (place + after) / 2, BETWEEN_STEPS * (place - after)))
+    beyond[np.isfinite(place[..., 0])] = False
+    return all(_most_adjacent(near) < ROW for near in (beyond, *between))
+
+
+def _near(stray_mm: FloatArray, expected_mm: FloatArray, radius_mm: FloatArray) -> BoolArray:
+    """Mask of the stray dots, shape (s, 2), near expected places, shape (rows, columns, s).
+
+    The places and the vectors as long as the radii have the shape (rows, columns, 2).
+    """
+    off = np.linalg.norm(expected_mm[..., None, :] - stray_mm, axis=-1)
+    return np.asarray(off <= np.linalg.norm(radius_mm, axis=-1)[..., None])
+
+
+def _most_adjacent(near: BoolArray) -> int:
+    """Largest number of different stray dots at connected places; mask of `_near`."""
+    at = np.asarray(near.any(axis=-1), np.uint8)
+    count, patch = cv2.connectedComponents(at, connectivity=8)
+    return max((int(near[patch == k].any(axis=0).sum()) for k in range(1, count)), default=0)
 
 
 def _counted(count: int, thing: str) -> str:
