@@ -230,9 +230,9 @@ def _decide_at_last(
         if refusal.status != "no-match" or not found:
             raise
         decided = _decide_with_other_setup(observed, found, lattice, settings)
-        if decided is None:
-            decided = _decide_among(observed, found, lattice, settings, MOST_SCATTERED_OF_ALL)
-        return decided
+        if decided is None and refusal.reason == NOTHING_EXPLAINS:
+            raise
+        return decided or _decide_among(observed, found, lattice, settings, MOST_SCATTERED_OF_ALL)
 
 
 def _decide_with_other_setup(
