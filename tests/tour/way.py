@@ -289,7 +289,7 @@ def _dots(hands: Hands) -> None:
 def _trends(hands: Hands, files: Path) -> None:
     hands.do("step_trends")
     hands.picture()
-    hands.choose("Spectrum of", "Height")
+    hands.choose("Spectrum of", "Length")
     hands.picture("spectrum")
     hands.choose("Spectrum of", "none")
     table = files / "current.csv"

@@ -111,7 +111,7 @@ class Spectrum(ReadOnlyArrays):
     """Amplitude spectrum of a measure."""
 
     frequency: FloatArray
-    """Frequencies from the lowest resolved one to half the frame rate, shape (k,), Hz, or 1/frame
+    """Frequencies from one period in the series to half the frame rate, shape (k,), Hz, or 1/frame
     if times are unknown.
     """
     amplitude: FloatArray
@@ -128,7 +128,7 @@ class Spectrum(ReadOnlyArrays):
 
     @property
     def peak(self) -> tuple[float, float]:
-        """Frequency and amplitude of the strongest oscillation."""
+        """Frequency and amplitude of the strongest oscillation; at the first one, of a drift."""
         strongest = int(np.argmax(self.amplitude))
         return float(self.frequency[strongest]), float(self.amplitude[strongest])
 

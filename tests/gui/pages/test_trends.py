@@ -74,7 +74,9 @@ def test_spectrum_is_shown_or_its_absence_explained(gtaw: Path, copy_sample) -> 
         shown = show(session, TrendOptions(spectrum_of="height_mm"))
         assert len(shown.spectrum[0].x) == 15
         assert shown.spectrum_axis.unit == "Hz"
-        assert shown.spectrum_words.startswith("Strongest at 2.0 Hz: 0.025 mm. Frames 0 to 29 (30)")
+        assert shown.spectrum_words.startswith("No oscillation stands out")  # one period: a drift
+        shown = show(session, TrendOptions(spectrum_of="length_mm"))
+        assert shown.spectrum_words.startswith("Strongest at 4.0 Hz: 0.47 mm. Frames 0 to 29 (30)")
         flat = show(session, TrendOptions(spectrum_of="depth_mm"))  # 0 in all frames
         assert flat.spectrum == ()
         assert flat.spectrum_words.startswith("There is no oscillation")

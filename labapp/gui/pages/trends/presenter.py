@@ -301,12 +301,18 @@ def _spectrum(course: Trend | None, timed: bool) -> tuple[tuple[Curve, ...], Axi
     )
     frequency, amplitude = found.peak
     place = max(0, 1 - int(np.floor(np.log10(found.resolution))))
+    nearest = f"{found.resolution:.2g} {axis.unit}"
+    if frequency == found.frequency[0]:  # one period in the series: perhaps a drift
+        strongest = f"No oscillation stands out: the value changes mostly below {nearest}"
+    else:
+        strongest = (
+            f"Strongest at {frequency:.{place}f} {axis.unit}: {amplitude:.2g} {quantity.unit}"
+        )
     return (
         (curve,),
         axis,
-        f"Strongest at {frequency:.{place}f} {axis.unit}: {amplitude:.2g} {quantity.unit}. "
-        f"Frames {found.first} to {found.last} ({found.count}), Hann window; oscillations nearer "
-        f"than {found.resolution:.2g} {axis.unit} are not resolved.",
+        f"{strongest}. Frames {found.first} to {found.last} ({found.count}), Hann window; "
+        f"oscillations nearer than {nearest} are not resolved.",
     )
 
 
