@@ -147,21 +147,21 @@ def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:
     labelled = hypothesis.labels != UNLABELLED
     place = np.full((*np.add(labelled.shape, 6), 2), np.nan)
     place[3:-3, 3:-3][labelled] = observed.plane_mm[hypothesis.labels[labelled]]
-    for axis in (0, 1):  # the absent dot, or a missing one, does not divide a row
-        middle = (np.roll(place, 1, axis) + np.roll(place, -1, axis)) / 2
-        place = np.where(np.isnan(place), middle, place)
     stray = observed.plane_mm[hypothesis.stray_dots]
     beyond = np.zeros((*place.shape[:2], len(stray)), bool)
     between = []
     for axis in (0, 1):
+        # The absent dot, or a missing one, does not divide the row beyond it.
+        beside = (np.roll(place, 1, 1 - axis) + np.roll(place, -1, 1 - axis)) / 2
+        known = np.where(np.isnan(place), beside, place)
         for step in (1, -1):
-            last, second, third = (np.roll(place, by * step, axis) for by in (1, 2, 3))
+            last, second, third = (np.roll(known, by * step, axis) for by in (1, 2, 3))
             radius = BEYOND_STEPS * (last - second)
-            beyond |= _near(stray, 2 * last - second, radius)
-            beyond |= _near(stray, 3 * (last - second) + third, radius)
+            near = _near(stray, 2 * last - second, radius)
+            near |= _near(stray, 3 * (last - second) + third, radius)
+            beyond |= near & np.isnan(known[..., :1])
         after = np.roll(place, 1, axis)
         between.append(_near(stray, (place + after) / 2, BETWEEN_STEPS * (place - after)))
-    beyond[np.isfinite(place[..., 0])] = False
     return all(_most_adjacent(near) < ROW for near in (beyond, *between))
 
 
