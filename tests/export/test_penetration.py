@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from labapp.core.dynamics.penetration import ModelSettings, PenetrationModel, fit_model
+from labapp.core.dynamics.penetration import Kind, ModelSettings, PenetrationModel, fit_model
 from labapp.core.dynamics.weld_series import Orders, WeldSeries, in_steps
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import Measures
@@ -36,10 +36,10 @@ WELDS = tuple(one.series for one in simulate_welds(4, 2))
 
 
 @cache
-def fitted(kind: str) -> PenetrationModel:
+def fitted(kind: Kind) -> PenetrationModel:
     settings = ModelSettings(FEATURES, TARGET, orders=Orders(1, 2, 1), full_mm=0.5)
     steps = [in_steps(one, settings.step_s) for one in WELDS[:3]]
-    model = fit_model(steps, kind, settings)  # type: ignore[arg-type]
+    model = fit_model(steps, kind, settings)
     return replace(model, factor=1.2, rmse_mm=0.1)
 
 

@@ -222,7 +222,8 @@ def _decide_at_last(
 ) -> tuple[Hypothesis, list[FreeHypothesis]]:
     """Decide among hypotheses of every kind, with another set-up if that as entered explains none.
 
-    Errors are those of `match_rays`.
+    If none explains more, the best is accepted with more isolated dots and rays left over. Errors
+    are those of `match_rays`.
     """
     try:
         return _decide_among(observed, found, lattice, settings, MOST_SCATTERED_AT_LAST)

@@ -34,8 +34,8 @@ PAIR, ROW = 2, 5
 BEYOND_STEPS, BETWEEN_STEPS = 0.45, 0.2
 """A stray dot continues the labels within these distances of its expected place: beyond the last
 dot of a row or column, as a share of the last step; between two dots, as a share of their distance.
-Of the outermost dots of 240 pools, 1 % lie farther from where the next ones lead, 10 % beside a
-dent."""
+Of the outermost dots of 240 pools less than 1 % lie farther from where the next ones lead, and 4 to
+7 % if the pool has waves or a dent."""
 
 FEW_SCATTERED, MOST_SCATTERED, MOST_SCATTERED_AT_LAST, MOST_SCATTERED_OF_ALL = 0.2, 0.3, 0.38, 0.9
 """Largest share of stray dots and missed rays together, relative to the labelled dots, that is

@@ -672,7 +672,7 @@ def test_opening_a_camera_can_be_cancelled(
 def test_choosing_a_file_ends_the_opening_of_a_camera(
     page: CapturePage, tmp_path: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
-    started, ended = threading.Event(), threading.Event()
+    started, stopped = threading.Event(), threading.Event()
 
     def slow(_text: str, progress: Callable[[int, int], None]) -> None:
         started.set()
@@ -680,8 +680,9 @@ def test_choosing_a_file_ends_the_opening_of_a_camera(
             for done in range(round(PATIENCE_S * 100)):
                 progress(done, 0)
                 time.sleep(0.01)
-        finally:
-            ended.set()
+        except BaseException:  # whatever stops a task
+            stopped.set()
+            raise
 
     monkeypatch.setattr(live_view, "pool_camera", slow)
     page.live_view.start()
@@ -689,7 +690,7 @@ def test_choosing_a_file_ends_the_opening_of_a_camera(
     np.save(tmp_path / "stack.npy", np.zeros((3, 20, 30), np.uint8))
     page.take(tmp_path / "stack.npy")
     qtbot.waitUntil(lambda: page.preview is not None)
-    assert ended.wait(1.0)
+    assert stopped.wait(PATIENCE_S)
     qtbot.waitUntil(lambda: not page.workspace.tasks.active)
 
 
