@@ -17,15 +17,17 @@ from labapp.core.matching.unexplained import explains, suffices
 from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice
 from labapp.core.values import IntArray
 from labapp.simulation.pools import egg
-from tests.benchmarks.dips import matched
+from tests.benchmarks.dips import draw, matched
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see, true_labels
 
 BENCH = Bench(BENCH_RIG, BENCH_VIEW)
 POOL = egg(5.4, 2.6, 3.0, 0.27)
+ISOLATED = 15
+"""Seed of ten false dots of which no three continue the rows side by side."""
 
 
-def seen_with(false: int, missing: int = 0, sigma_px: float = 0.05) -> SeenDots:
-    rng = np.random.default_rng(6)
+def seen_with(false: int, missing: int = 0, sigma_px: float = 0.05, seed: int = 6) -> SeenDots:
+    rng = np.random.default_rng(seed)
     return see(POOL, rng, sigma_px=sigma_px, missing=missing, false=false)
 
 
@@ -38,7 +40,7 @@ def hypothesis(seen: SeenDots, labels: IntArray | None = None) -> tuple[Observat
 
 
 def test_isolated_false_dots_leave_a_hypothesis_that_suffices() -> None:
-    observed, found = hypothesis(seen_with(false=10))
+    observed, found = hypothesis(seen_with(false=10, seed=ISOLATED))
     assert (found.stray_count, found.missed_count) == (10, 0)
     assert not explains(observed, found)
     assert suffices(observed, found)
@@ -87,7 +89,7 @@ def searched_with(seen: SeenDots, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_isolated_false_dots_do_not_prolong_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert searched_with(seen_with(false=10), monkeypatch) == ["_by_lattice"]
+    assert searched_with(seen_with(false=10, seed=ISOLATED), monkeypatch) == ["_by_lattice"]
 
 
 def test_a_cluttered_frame_is_searched_in_other_ways(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,7 +112,19 @@ def test_dots_between_labelled_rows_are_a_row() -> None:
     row = np.flatnonzero((labels != UNLABELLED).any(axis=1))[2]
     labels[row:-1], labels[-1] = labels[row + 1 :], UNLABELLED
     observed, found = hypothesis(seen, labels)
-    assert not unexplained._strays_lie_apart(observed, found)
+    assert unexplained._strays_in_line(observed, found) >= unexplained.ROW
+
+
+def test_dots_beside_and_between_the_same_labels_are_a_row() -> None:
+    """The two dots of the first row have the rays of the second, whose dots have none."""
+    _, seen = draw(7246)
+    labels = true_labels(seen)
+    first, second = np.flatnonzero((labels != UNLABELLED).any(axis=1))[:2]
+    dots = np.sum(labels[second] != UNLABELLED)
+    labels[second], labels[first] = labels[first], UNLABELLED
+    observed, found = hypothesis(seen, labels)
+    assert found.stray_count == unexplained._strays_in_line(observed, found) == dots
+    assert not suffices(observed, found)
 
 
 @pytest.fixture
@@ -160,6 +174,6 @@ def test_fine_knots_are_not_tried_if_the_usual_ones_confirm_the_labels(
 
 
 def test_nothing_is_repaired_if_only_isolated_dots_are_left(grown: list[IntArray]) -> None:
-    observed, found = hypothesis(seen_with(false=10))
+    observed, found = hypothesis(seen_with(false=10, seed=ISOLATED))
     assert with_repaired(observed, [], [found]) == [found]
     assert not grown

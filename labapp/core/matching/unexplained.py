@@ -28,8 +28,9 @@ than 0.3 even if the set-up is slightly wrong, more than 1 if the labels are wro
 NOTHING_EXPLAINS = "no surface explains the reflected dots"
 """Reason for ``no-match`` if most of the dots have no ray."""
 
-PAIR, ROW = 2, 5
-"""Up to so many adjacent missed rays are not taken for a row; so many adjacent stray dots are."""
+PAIR, ROW = 2, 4
+"""Up to the first number of adjacent missed rays, or of stray dots in line, is not taken for a row;
+the second number of stray dots in line is."""
 
 BEYOND_STEPS, BETWEEN_STEPS = 0.45, 0.2
 """A stray dot continues the labels within these distances of its expected place: beyond the last
@@ -65,7 +66,7 @@ def suffices(observed: Observation, hypothesis: Hypothesis) -> bool:
     return explains(observed, hypothesis) or (
         hypothesis.residual_rms_mm < KNOT_ERROR_MM
         and _leaves_isolated(hypothesis, FEW_SCATTERED)
-        and _strays_lie_apart(observed, hypothesis)
+        and _strays_in_line(observed, hypothesis) <= PAIR
     )
 
 
@@ -89,7 +90,7 @@ def refuse_unexplained(
     """
     few = best.stray_count <= settings.most_strays(best.label_count + best.stray_count)
     scattered = _leaves_isolated(best, most_scattered) and (
-        few or _strays_lie_apart(observed, best)
+        few or _strays_in_line(observed, best) < ROW
     )
     if not explains_half(observed, best):
         raise CannotMeasure("no-match", NOTHING_EXPLAINS)
@@ -137,8 +138,8 @@ def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
     return bool((count <= PAIR + (sides == PAIR).all(axis=1)).all())
 
 
-def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:
-    """Whether fewer than `ROW` neighbouring stray dots continue the labelled rows and columns.
+def _strays_in_line(observed: Observation, hypothesis: Hypothesis) -> int:
+    """Largest number of stray dots side by side that continue the labelled rows and columns.
 
     An omitted row lies where the labelled dots beside it lead, by equal steps or by steps that
     change equally; a skipped one lies half-way between two labelled dots. False dots elsewhere are
@@ -148,21 +149,28 @@ def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:
     place = np.full((*np.add(labelled.shape, 6), 2), np.nan)
     place[3:-3, 3:-3][labelled] = observed.plane_mm[hypothesis.labels[labelled]]
     stray = observed.plane_mm[hypothesis.stray_dots]
-    beyond = np.zeros((*place.shape[:2], len(stray)), bool)
-    between = []
-    for axis in (0, 1):
-        # The absent dot, or a missing one, does not divide the row beyond it.
-        beside = (np.roll(place, 1, 1 - axis) + np.roll(place, -1, 1 - axis)) / 2
-        known = np.where(np.isnan(place), beside, place)
-        for step in (1, -1):
-            last, second, third = (np.roll(known, by * step, axis) for by in (1, 2, 3))
-            radius = BEYOND_STEPS * (last - second)
-            near = _near(stray, 2 * last - second, radius)
-            near |= _near(stray, 3 * (last - second) + third, radius)
-            beyond |= near & np.isnan(known[..., :1])
-        after = np.roll(place, 1, axis)
-        between.append(_near(stray, (place + after) / 2, BETWEEN_STEPS * (place - after)))
-    return all(_most_adjacent(near) < ROW for near in (beyond, *between))
+    return max(_most_in_line(along, stray) for along in (place, place.swapaxes(0, 1)))
+
+
+def _most_in_line(place: FloatArray, stray_mm: FloatArray) -> int:
+    """As `_strays_in_line`, for rows; labelled dots, shape (rows, columns, 2), mm, else NaN."""
+    # The absent dot, or a missing one, does not divide the row beyond it.
+    beside = (np.roll(place, 1, 1) + np.roll(place, -1, 1)) / 2
+    known = np.where(np.isnan(place), beside, place)
+    after = np.roll(place, 1, 0)
+    between = _near(stray_mm, (place + after) / 2, BETWEEN_STEPS * (place - after))
+    near = between | np.roll(between, -1, 0)  # a skipped row is either of the two
+    for step in (1, -1):
+        last, second, third = (np.roll(known, by * step, 0) for by in (1, 2, 3))
+        radius = BEYOND_STEPS * (last - second)
+        beyond = _near(stray_mm, 2 * last - second, radius)
+        beyond |= _near(stray_mm, 3 * (last - second) + third, radius)
+        near |= beyond & np.isnan(known[..., :1])
+    most = 0
+    for row in near[near.any(axis=(1, 2))]:
+        parts = np.split(row, np.flatnonzero(~row.any(axis=1)))
+        most = max(most, *(int(part.any(axis=0).sum()) for part in parts))
+    return most
 
 
 def _near(stray_mm: FloatArray, expected_mm: FloatArray, radius_mm: FloatArray) -> BoolArray:
@@ -172,13 +180,6 @@ def _near(stray_mm: FloatArray, expected_mm: FloatArray, radius_mm: FloatArray) 
     """
     off = np.linalg.norm(expected_mm[..., None, :] - stray_mm, axis=-1)
     return np.asarray(off <= np.linalg.norm(radius_mm, axis=-1)[..., None])
-
-
-def _most_adjacent(near: BoolArray) -> int:
-    """Largest number of different stray dots at connected places; mask of `_near`."""
-    at = np.asarray(near.any(axis=-1), np.uint8)
-    count, patch = cv2.connectedComponents(at, connectivity=8)
-    return max((int(near[patch == k].any(axis=0).sum()) for k in range(1, count)), default=0)
 
 
 def _counted(count: int, thing: str) -> str:
