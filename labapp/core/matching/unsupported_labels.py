@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labapp.core.images import band_pass_kernels
 from labapp.core.match import missing_share
-from labapp.core.matching.observation import UNLABELLED, Observation
+from labapp.core.matching.observation import UNLABELLED, Observation, amid
 from labapp.core.matching.prediction import (
     FALSE_DOTS_PER_MM2,
     GATE_SIGMA2,
@@ -99,8 +100,9 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     wider than those around it is two merged dots; a less wide one counts as merged if a ray without
     a dot is predicted beside it. With few neighbours, at the rim, a label must be nearer to its
     prediction than elsewhere. One without neighbours may be that of the next ray, since nothing
-    determines its place in the row. If all labels are farther from their predictions than the
-    uncertainty of dots and surface explains, that uncertainty is increased accordingly.
+    determines its place in the row; nor is one kept beside rays and dots that have none
+    (`_beside_free_dots`). If all labels are farther from their predictions than the uncertainty of
+    dots and surface explains, that uncertainty is increased accordingly.
 
     A false dot shifts the predictions of its neighbours. Of adjacent labels that fail, only the one
     with the largest distance in σ is returned, as the others may pass after its removal.
@@ -148,7 +150,7 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
         stray,
         limits,
     )
-    return np.asarray(labels[fails | _wide(observed, fitted)])
+    return np.asarray(labels[fails | _wide(observed, fitted) | _beside_free_dots(observed, labels)])
 
 
 def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:
@@ -165,6 +167,26 @@ def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:
         apart_mm = np.linalg.norm(dark_mm - plane_mm[ray], axis=-1)
         wide.flat[ray] = (apart_mm < BESIDE_RESOLUTIONS * observed.resolution_mm).any()
     return wide
+
+
+def _beside_free_dots(observed: Observation, labels: IntArray) -> BoolArray:
+    """Mask of labels that may be those of adjacent rays without a dot, shape (rows, columns).
+
+    Where rows cross in a dip their dots get no ray, and the surface bends towards a wrong one
+    beside them. Such a label has at least two adjacent rays without a dot, and two dots without a
+    ray are nearer to it than any other labelled dot.
+    """
+    lit = labels != UNLABELLED
+    dark = np.pad(amid(lit) & ~lit & ~observed.rays.absent, 1).astype(np.int64)
+    adjacent = dark[:-2, 1:-1] + dark[2:, 1:-1] + dark[1:-1, :-2] + dark[1:-1, 2:]
+    beside = lit & (adjacent > 1)
+    if beside.any():
+        free = np.setdiff1d(np.arange(len(observed.plane_mm)), labels)
+        dots = observed.plane_mm[labels[beside]]
+        to_free = band_pass_kernels.two_nearest(dots, observed.plane_mm[free])[0][:, 1]
+        to_lit = band_pass_kernels.two_nearest(dots, observed.plane_mm[labels[lit]])[0][:, 1]
+        beside[beside] = to_free < to_lit
+    return beside
 
 
 def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> FloatArray:
