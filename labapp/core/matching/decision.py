@@ -10,6 +10,7 @@ import numpy as np
 from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open, unconfirmed
 from labapp.core.matching.hypothesis import (
     FINE_FIT,
+    KNOT_ERROR_MM,
     MISSED_COST,
     STRAY_COST,
     USUAL_FIT,
@@ -47,13 +48,13 @@ CLOSE_COST = 40.0
 """A rival whose cost is within this of the lowest is examined further, in units of χ²: a dip under
 the torch, or dots that shifted labels have not yet found, may add as much to a cost."""
 
-FOLLOWED_MM = 0.03
-"""If the residuals of the best hypothesis are larger, fine knots are needed to decide: most frames
-have residuals of 0.010 to 0.025 mm."""
+FOLLOWED_MM, CLOSE_IN_DIP = 0.03, 120.0
+"""If the residuals of the best hypothesis are larger than the first, rivals within the second are
+examined further: of the residuals of rows that cross in a dip the usual knots can follow less."""
 
 FAR_AHEAD = 60.0
 """A rival that costs more by this in the mean of fine and usual knots is beaten even if it costs
-less with fine ones. Wrong rows led right ones by 35 to 41, right rows wrong ones by 71."""
+less with fine ones. Wrong rows led the right ones by 35 to 41; right rows led by 71."""
 
 QUICK_MISFIT_TIMES = 4.0
 """Labels whose quick fit has more than this multiple of the best residual are not rivals. Of 700
@@ -253,8 +254,9 @@ def _cheapest(
     if best.stray_count or best.missed_count:
         neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), fit_settings)
     # Residuals of a dip that this fit cannot follow may decide between rivals this close.
-    near = any(rival.cost < best.cost + CLOSE_COST for rival in neighbours or ())
-    if near or best.residual_rms_mm > FOLLOWED_MM:
+    close = CLOSE_COST if best.residual_rms_mm < FOLLOWED_MM else CLOSE_IN_DIP
+    near = any(rival.cost < best.cost + close for rival in neighbours or ())
+    if near or best.residual_rms_mm > KNOT_ERROR_MM:
         fit_settings, neighbours = FINE_FIT, None
         fine = evaluate_averaged(observed, best.labels, fit_settings, best.pool)
         # The mean is at least half of the usual cost: hypotheses above this are no rivals.
@@ -284,24 +286,29 @@ def _clearly_cheaper(
     """Whether the best hypothesis costs less than another by the margin.
 
     With fine knots it must be far ahead, or cost less with both kinds of knots, and by the margin
-    with one of them: where rows cross in a narrow dip, wrong rows cost less with the usual knots.
-    As the dot at the marker may be false, another hypothesis that costs less without the marker is
-    a rival.
+    with one of them, unless the usual knots can follow its surface: where rows cross in a narrow
+    dip, wrong rows cost less if they cannot. As the dot at the marker may be false, another
+    hypothesis that costs less without the marker is a rival.
     """
     if other.cost_without_marker < best.cost_without_marker:
         return False
     # With a wrong set-up and many false dots, wrong rows led by more than one margin.
     many_false = best.stray_count > settings.most_strays(best.label_count + best.stray_count)
     margin = (2 if many_false else 1) * settings.margin
+    ahead = other.cost >= best.cost + margin
     if fit_settings != FINE_FIT or other.cost >= best.cost + FAR_AHEAD:
-        return other.cost >= best.cost + margin
-    ahead = []
-    for each in (FINE_FIT, USUAL_FIT):
-        own, rival = (evaluate(observed, h.labels, each, initial=h.pool) for h in (best, other))
-        if own is None or rival is None:
+        return ahead
+    costs = []
+    for each in (best, other):
+        fine = evaluate(observed, each.labels, FINE_FIT, initial=each.pool)
+        usual = evaluate(observed, each.labels, USUAL_FIT, initial=each.pool)
+        if fine is None or usual is None:
             return False
-        ahead.append(rival.cost - own.cost)
-    return min(ahead) >= 0 and max(ahead) >= margin
+        costs.append((fine.cost, usual.cost))
+    own, rival = np.array(costs)
+    if ahead and own[1] < own[0] + margin:
+        return True
+    return bool((rival >= own).all() and (rival >= own + margin).any())
 
 
 def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> bool:
@@ -348,18 +355,15 @@ def _rivals(
     """Evaluate other labels as rivals of a hypothesis, except those that cannot come close to it.
 
     Their residuals must be comparable. With the usual knots, their cost with a rough fit must be
-    comparable too. (Fine knots are used for a dip, which the rough fit does not follow.)
+    comparable too, unless there is a dip, which the rough fit does not follow.
     """
     most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_rms_mm)
     labelled = [best.labels, *labelled]
     quick_mm = observed.quick_misfits(labelled, best.pool)
     far_mm = QUICK_MISFIT_TIMES * quick_mm[0]
     rough = try_fit(observed, best.labels, initial=best.pool)
-    costs = (
-        None
-        if rough is None or fit_settings == FINE_FIT
-        else rough_costs(observed, best.labels, rough)
-    )
+    dipped = fit_settings == FINE_FIT or best.residual_rms_mm > FOLLOWED_MM
+    costs = None if rough is None or dipped else rough_costs(observed, best.labels, rough)
     rivals = []
     for labels, off_mm in zip(labelled[1:], quick_mm[1:], strict=True):
         pool = None if off_mm > far_mm else try_fit(observed, labels, initial=best.pool)
