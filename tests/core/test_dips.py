@@ -70,7 +70,7 @@ def test_pool_with_a_dip_gets_the_right_rows(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 8, 12])
+@pytest.mark.parametrize("seed", [1, 7, 8, 13])
 def test_rows_crossing_at_the_marker_are_not_shifted(seed: int) -> None:
     """The usual knots cannot follow this dip. The rows were once one off."""
     pool = egg(6.0, 2.73, 4.46, 0.18, (-0.08, -0.37), (Dent(0.065, 0.68, (-0.215, 1.29)),))
