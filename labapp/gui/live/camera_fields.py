@@ -209,7 +209,8 @@ def region_of(text: str) -> Region:
     InputError
         If they are not four whole numbers.
     """
-    found = re.fullmatch(r"\s*(\d{1,6})" + r"[\s,;]+(\d{1,6})" * 3 + r"\s*", text)
+    number = r"(0|[1-9]\d{0,5})"  # "024" is the rest of "1 024"
+    found = re.fullmatch(rf"\s*{number}" + rf"[\s,;]+{number}" * 3 + r"\s*", text)
     if found is None:
         expected = "four whole numbers: left, top, width, height (px)"
         raise InputError("camera", "region", text.strip(), expected)

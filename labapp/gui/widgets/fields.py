@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from labapp.gui.digits import entered, parsed
+from labapp.gui.digits import entered, parsed, with_thousands
 from labapp.gui.widgets.labels import plain_label, plain_tip, show_words, wrapping_label
 from labapp.gui.widgets.layouts import hbox, vbox
 
@@ -197,6 +197,8 @@ class NumberField(Field):
         kept = self._shown(self._value) or "nothing"
         if not text.strip():
             return None, "" if self.optional else f"A number is needed; {kept} stays"
+        if self.decimals == 0 and not {".", ","}.isdisjoint(text):  # they may separate thousands
+            return None, f"“{text.strip()}” is not a whole number in digits only; {kept} stays"
         value = parsed(text)
         if value is None:
             return None, f"“{text.strip()}” is not a number; {kept} stays"
@@ -208,6 +210,10 @@ class NumberField(Field):
             if value != int(value):
                 return None, f"“{text.strip()}” is not a whole number; {kept} stays"
             return int(value), ""
+        other = with_thousands(text)
+        if other is not None and self.lowest <= other <= self.highest:
+            words = f"“{text.strip()}” can be {value:.7g} or {other:.7g}: write it without a comma"
+            return None, f"{words}; {kept} stays"
         return value, ""
 
     def _step(self, steps: int) -> None:
