@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,6 +41,8 @@ from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.text import format_bytes, pluralize
+
+CHANGED = "The scheme has just changed: see what will be written now, and press Export again"
 
 WHICH = (
     ("all", "all that are measured"),
@@ -80,8 +83,7 @@ class ExportPage(Page):
             if self.request.which == "view":
                 self._show_plan(session)
             return
-        if not self.folder.value():
-            self.folder.set_value(str(proposed_folder(session)))
+        self._propose_folder()
         self.scheme.set_choices(schemes(session))
         self.request = replace(self.request, scheme=self.scheme.value())
         if len(session.frames) and not self.request.last:
@@ -186,9 +188,14 @@ class ExportPage(Page):
                 box.setChecked(on)
         self._ticked()
 
+    def _propose_folder(self) -> None:
+        """Show the default folder if none is entered."""
+        if not self.folder.value().strip():
+            self.folder.set_value(str(proposed_folder(self.session)))
+
     def choose_folder(self) -> None:
         """Ask for a folder; use a new subfolder if it contains something else."""
-        here = Path(self.folder.value() or proposed_folder(self.session))
+        here = Path(self.folder.value().strip() or proposed_folder(self.session))
         if folder := ask_folder(self, "Export folder", here.parent):
             self.folder.set_value(str(folder_within(folder, self.session)))
 
@@ -199,10 +206,16 @@ class ExportPage(Page):
 
     def export(self) -> None:
         """Export the ticked items in the background."""
-        session, made, request = self.session, self.plan, self.request
+        session, shown = self.session, self.plan
+        self._show_plan(session)  # the window may show a change with a delay
+        made, request = self.plan, self.request
         if made is None or made.why_not:
             return
-        folder = Path(self.folder.value() or proposed_folder(session)).expanduser()
+        if shown is None or made.scheme != shown.scheme:
+            self._say(f"{PROBLEM} {CHANGED}")
+            return
+        name = self.folder.value().strip() or proposed_folder(session)
+        folder = Path(os.path.expanduser(name))  # `Path.expanduser` raises for an unknown user
         if not folder.is_absolute():
             folder = folder_of(session) / folder
         frames = made.frames.tolist()
@@ -305,6 +318,7 @@ class ExportPage(Page):
             "Folder",
             tooltip="A new or empty folder, or an earlier export, which is replaced",
         )
+        self.folder.edited.connect(lambda _: self._propose_folder())
         choose = button("Choose folder…", "Choose where to write", self.choose_folder)
         self.notes = wrapping_label()
         self.again_button = button(
