@@ -158,6 +158,21 @@ def test_cancelling_keeps_finished_parts(
     assert analysis.isVisible() == (how == "escape")
 
 
+def test_disabled_buttons_say_why(analysis: AnalysisWindow, qtbot: QtBot):
+    enabled = analysis.start_button.toolTip()
+    tick(analysis)
+    assert not analysis.start_button.isEnabled()
+    assert "Tick" in analysis.start_button.toolTip()
+    tick(analysis, "budget")
+    analysis.start()
+    assert not analysis.start_button.isEnabled()
+    assert analysis.start_button.toolTip() not in ("", enabled)
+    analysis.cancel()
+    qtbot.waitUntil(lambda: not analysis.working)
+    assert analysis.start_button.toolTip() == enabled
+    assert not analysis.cancel_button.isEnabled()
+
+
 def test_new_parts_replace_the_previous_ones(analysis: AnalysisWindow, qtbot: QtBot):
     run_analysis(analysis, qtbot)
     tick(analysis)

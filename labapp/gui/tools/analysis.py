@@ -10,9 +10,9 @@ from PySide6.QtWidgets import QCheckBox, QSizePolicy, QStackedWidget, QWidget
 from labapp.gui.tasks import Control
 from labapp.gui.tools import analysis_presenter as presenter
 from labapp.gui.tools.analysis_presenter import BUDGET, OPENED, PARTS, USUAL
-from labapp.gui.tools.tool import ToolWindow, progress_of
+from labapp.gui.tools.tool import WORKING, ToolWindow, progress_of
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, flush_fields, whole
-from labapp.gui.widgets.labels import allow, heading, show_words, wrapping_label
+from labapp.gui.widgets.labels import heading, show_words, wrapping_label
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 from labapp.studies import SCHEME_NAMES
@@ -35,9 +35,6 @@ SIZES = (
     ("length", "Length", 1.0, 30.0, 0.1, "Of the expected pool, along Y"),
     ("height", "Height", -30.0, 30.0, 0.01, "Of the expected pool; negative for a concave one"),
 )
-
-
-START_TIP = "Compute what is ticked; each part is shown when it is done"
 
 
 class AnalysisWindow(ToolWindow):
@@ -128,7 +125,9 @@ class AnalysisWindow(ToolWindow):
         self.add_save_button(
             "Save the results…", "Write all tables (CSV, Markdown) and pictures to a folder"
         )
-        self.start_button = self.add_button("Run", START_TIP, self.start)
+        self.start_button = self.add_button(
+            "Run", "Compute what is ticked; each part is shown when it is done", self.start
+        )
 
     # --- what is to be worked out --------------------------------------------------------------
 
@@ -224,6 +223,6 @@ class AnalysisWindow(ToolWindow):
         """Enable the actions that are available now."""
         ticked, why = any(box.isChecked() for box in self.parts.values()), self._why_not()
         show_words(self.why, why)
-        allow(self.start_button, START_TIP, why)
-        self.start_button.setEnabled(ticked and not self.working and not why)
-        self.save_button.setEnabled(bool(self.files))
+        unticked = "" if ticked else "Tick what is to be computed"
+        self.offer(self.start_button, why or unticked or (WORKING if self.working else ""))
+        self.offer(self.save_button, "" if self.files else "There are no results yet: press Run")
