@@ -207,7 +207,7 @@ class LiveWatch:
         for each in (former, made):
             if each is not None and each is not self._measuring:
                 each.close()
-        words = "no frame is measured" if setup is None else "frames are measured with it"
+        words = "nothing is measured" if setup is None else "frames are measured with the new ones"
         self._on_event(Event(self._name, "note", f"set-up or settings changed: {words}"), None)
 
     def set_limits(self, limits: Limits) -> None:
