@@ -56,7 +56,7 @@ def test_numbers_accept_point_or_comma_and_either_minus():
         ("1,250", 1e4, None),
         ("+１,２５０", 1e4, None),
         ("1,250e1", 1e5, None),
-        ("1,250", 90, 1.25),  # 1250 is out of range
+        ("1,250", 90, None),  # 1250 is not read as 1.25 where it is out of range
         ("0,250", 1e4, 0.25),
         ("1,25", 1e4, 1.25),
         ("1.250", 1e4, 1.25),

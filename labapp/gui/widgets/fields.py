@@ -202,6 +202,10 @@ class NumberField(Field):
         value = parsed(text)
         if value is None:
             return None, f"“{text.strip()}” is not a number; {kept} stays"
+        other = with_thousands(text)
+        if other is not None:
+            words = f"“{text.strip()}” can be {value:.7g} or {other:.7g}: write it without a comma"
+            return None, f"{words}; {kept} stays"
         if not self.lowest <= value <= self.highest:
             low, high = (entered(end, 0) for end in (self.lowest, self.highest))
             words = f"from {low} to {high} {self.unit.text()}".strip()
@@ -210,10 +214,6 @@ class NumberField(Field):
             if value != int(value):
                 return None, f"“{text.strip()}” is not a whole number; {kept} stays"
             return int(value), ""
-        other = with_thousands(text)
-        if other is not None and self.lowest <= other <= self.highest:
-            words = f"“{text.strip()}” can be {value:.7g} or {other:.7g}: write it without a comma"
-            return None, f"{words}; {kept} stays"
         return value, ""
 
     def _step(self, steps: int) -> None:
