@@ -42,6 +42,8 @@ from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.text import format_bytes, pluralize
 
+OPEN = "Show what was exported in the file manager"
+
 CHANGED = "The scheme has just changed: see what will be written now, and press Export again"
 
 WHICH = (
@@ -154,7 +156,8 @@ class ExportPage(Page):
         self.again_button.setVisible(again)
         self.again_button.setEnabled(again and not measuring)
         self.again_button.setText("Measuring…" if measuring else f"Measure {len(made.again)} now")
-        self.open_button.setEnabled(self.written is not None)
+        unwritten = "" if self.written is not None else "Nothing has been exported yet"
+        allow(self.open_button, OPEN, unwritten)
 
     def _session_opened(self) -> None:
         self.written = self.plan = self._in_view = None
@@ -328,8 +331,7 @@ class ExportPage(Page):
         )
         keep_room(self.again_button)
         self.export_button = button("Export", "", self.export)
-        tip = "Show what was exported in the file manager"
-        self.open_button = button("Open the folder", tip, self.open_folder)
+        self.open_button = button("Open the folder", OPEN, self.open_folder)
         # The buttons are above the text, whose height varies.
         fill(
             self.panel_layout,
