@@ -295,13 +295,14 @@ class DynamicsWindow(ToolWindow):
         seen = None if present is None else present.seen
         why = presenter.impossible(self.workspace.session, seen)
         text = why or (presenter.range_text(seen) if seen is not None else "")
-        if self.drawn is not None and not presenter.same_results(present, self._of):
+        changed = self.drawn is not None and not presenter.same_results(present, self._of)
+        if changed:
             text = f"{CHANGED} {text}"
         self.words.setText(text)
         working = WORKING if self.working else ""
         drawn = "" if self.drawn is not None else "There are no results yet: press Analyse"
         self.offer(self.start_button, why or working)
-        self.offer(self.save_button, drawn or working)
+        self.offer(self.save_button, drawn or working or (CHANGED if changed else ""))
         chosen = "" if self.modes.currentRow() >= 0 else "Select a mode in the table"
         allow(self.play_button, PLAY_TIP, chosen or working)
         chosen = "" if self.events.selectedItems() else "Select an event in the table"
