@@ -20,6 +20,10 @@ class Mark:
     words: str
 
 
+GAP = 2
+"""A line is interrupted where the frame numbers of its points differ by more than their usual
+difference times this: a single missing frame does not interrupt it."""
+
 PLAIN = Mark("●", "")
 
 
@@ -65,6 +69,15 @@ class Curve(ReadOnlyArrays):
     """Whether marks are drawn only where they are not the usual one, because the curve is redrawn
     many times per second.
     """
+
+    @property
+    def line(self) -> tuple[FloatArray, FloatArray]:
+        """Points of its line, which is interrupted where frames are missing (`GAP`)."""
+        if self.quick or len(self.key) < 3:
+            return self.x, self.y
+        step = np.diff(self.key)
+        gap = np.flatnonzero(step > GAP * np.median(step)) + 1
+        return np.insert(self.x, gap, self.x[gap]), np.insert(self.y, gap, np.nan)
 
     @property
     def title(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -55,6 +56,14 @@ def parsed(entry: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
+
+
+def with_thousands(entry: str) -> float | None:
+    """The entered number if its comma separates thousands, as in 1,250; None if it cannot."""
+    grouped = re.fullmatch(r"([-+−]?\d{1,3}),(\d{3})(e.*)?", entry.strip(), re.IGNORECASE)
+    if grouped is None or not parsed(grouped[1]):  # no one writes 0,250 for 250
+        return None
+    return parsed("".join(filter(None, grouped.groups())))
 
 
 def as_text(rows: Iterable[ResultRow]) -> str:

@@ -74,6 +74,11 @@ class LiveTrend:
         self._names: tuple[str, ...] = NAMES
         self._turn = threading.Lock()
 
+    def clear(self) -> None:
+        """Remove all frames."""
+        with self._turn:
+            self._frames.clear()
+
     def add(self, result: LiveResult) -> None:
         """Add the next frame."""
         done_s, measures = time.monotonic(), result.measurement.measures

@@ -54,12 +54,13 @@ class LiveWatch:
         self.alarms, self.trend = Alarms(limits), LiveTrend()
         """Alarms; sizes of the last frames, and rate of measuring."""
         self._name, self._scheme, self._on_event = name, settings.scheme, on_event
-        self._measuring = LiveMeasuring(setup, settings, bit_depth)
+        self._bit_depth = bit_depth
+        self._measuring: LiveMeasuring | None = LiveMeasuring(setup, settings, bit_depth)
         self.queue = FrameQueue()
         """Frames to be measured."""
         self._newest: deque[LiveResult] = deque(maxlen=1)
         self._scene: deque[Scene] = deque(maxlen=1)
-        self._turn = threading.Lock()
+        self._turn, self._handing_on = threading.Lock(), threading.Lock()
         self._streams: dict[str, Stream] = {}
         self._is_closed = False
         self._measured_s, self._last = time.monotonic(), (0, 0.0)
@@ -77,7 +78,10 @@ class LiveWatch:
         with self._turn:
             self._is_closed = True  # no alarm when measuring ends
             streams, self._streams = self._streams, {}
-        self._measuring.close()
+        with self._handing_on:
+            measuring, self._measuring = self._measuring, None
+        if measuring is not None:
+            measuring.close()
         for stream in streams.values():
             stream.close()
 
@@ -98,18 +102,22 @@ class LiveWatch:
         LiveMeasuringEnded
             If the measuring process has ended.
         """
-        drawn, began_s = self._is_drawn.is_set(), time.monotonic()
+        drawn, began_s, measuring = self._is_drawn.is_set(), time.monotonic(), self._measuring
+        if measuring is None:
+            return
         try:
-            result = self._measuring.measure(frame, drawn)
+            result = measuring.measure(frame, drawn)
         except Exception as error:
-            if not self._is_closed:
-                self._raise_silence(f"Nothing is measured any more: {error}")
+            if measuring is not self._measuring:
+                return  # the set-up was changed, or this was closed
+            self._raise_silence(f"Nothing is measured any more: {error}")
             raise
         is_tracked = result is not None and result.track_lost is None
         self.queue.done(is_tracked, time.monotonic() - began_s)
-        if result is not None:
-            for sink in self._sinks:
-                sink(result)
+        with self._handing_on:
+            if result is not None and measuring is self._measuring:
+                for sink in self._sinks:
+                    sink(result)
 
     def _judge(self, result: LiveResult) -> None:
         """Raise alarms, or end them."""
@@ -183,6 +191,24 @@ class LiveWatch:
         return events
 
     # --- changes ------------------------------------------------------------------------------
+
+    def set_setup(self, setup: Setup | None, settings: Settings) -> None:
+        """Measure the next frames with another set-up or other settings; None: measure none.
+
+        Results of the former ones are discarded; recordings, alarms and streams continue.
+        """
+        made = None if setup is None else LiveMeasuring(setup, settings, self._bit_depth)
+        with self._handing_on:
+            former, self._measuring = self._measuring, None if self._is_closed else made
+            self._scheme, self._measured_s = settings.scheme, time.monotonic()
+            self._newest.clear()
+            self._scene.clear()
+            self.trend.clear()
+        for each in (former, made):
+            if each is not None and each is not self._measuring:
+                each.close()
+        words = "nothing is measured" if setup is None else "frames are measured with the new ones"
+        self._on_event(Event(self._name, "note", f"set-up or settings changed: {words}"), None)
 
     def set_limits(self, limits: Limits) -> None:
         """Replace the limits from the next frame on."""

@@ -51,7 +51,8 @@ def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
         ):
             there.backup(here)
     except (OSError, sqlite3.Error) as error:
-        raise InputError(path, "file", error, "a folder that can be written") from error
+        why = error.strerror if isinstance(error, OSError) else None
+        raise InputError(path, "file", why or error, "a folder that can be written") from error
     with Session.open(path) as copy:
         recording = copy.recording
         if recording is not None and copy.missing_recording is not None:

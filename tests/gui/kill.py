@@ -45,10 +45,10 @@ def work(path: Path, recording: Path, pipe: int) -> None:
     def report(number: int) -> None:
         os.write(pipe, number.to_bytes(NUMBER_BYTES, "little"))
 
-    measure, import_recording = Session.measure, Session.import_recording
+    measure_each, import_recording = Session.measure_each, Session.import_recording
 
-    def measured(session, frames=None, pool=None):  # type: ignore[no-untyped-def]
-        for number, measurement in measure(session, frames, pool):
+    def measured(session, *args, **kwargs):  # type: ignore[no-untyped-def]
+        for number, measurement in measure_each(session, *args, **kwargs):
             report(number)
             yield number, measurement
 
@@ -59,7 +59,7 @@ def work(path: Path, recording: Path, pipe: int) -> None:
 
         return import_recording(session, *args, progress=step, **kwargs)
 
-    Session.measure = measured  # type: ignore[method-assign]
+    Session.measure_each = measured  # type: ignore[method-assign]
     Session.import_recording = imported  # type: ignore[method-assign]
     app = start_app()
     window = make_window(Preferences(), path.with_name("preferences.json"))

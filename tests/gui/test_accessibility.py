@@ -26,6 +26,7 @@ from PySide6.QtWidgets import (
     QMenu,
     QMessageBox,
     QPlainTextEdit,
+    QPushButton,
     QScrollArea,
     QSpinBox,
     QTabBar,
@@ -331,7 +332,12 @@ def test_tool_windows_are_keyboard_accessible(opened: MainWindow, key: str, qtbo
     assert tool is not None
     qtbot.waitUntil(tool.isActiveWindow)
     assert tool.form.isAncestorOf(QApplication.focusWidget())
+    before = tips(tool)
     FILL[key](tool, qtbot)
+    qtbot.waitUntil(lambda: not tool.working)
+    for one, (enabled, tip) in tips(tool).items():
+        if before[one][0] != enabled:
+            assert before[one][1] != tip, f"{one.text()}: no reason why it is disabled"
     reached = check_round(tool)
     enabled = [button for button in (tool.start_button, tool.close_button) if button.isEnabled()]
     assert [each for each in reached if each in enabled] == enabled
@@ -345,6 +351,12 @@ def test_tool_windows_are_keyboard_accessible(opened: MainWindow, key: str, qtbo
             assert button.width() >= button.sizeHint().width() - 1, button.text()
     QTest.keyClick(tool, Qt.Key.Key_Escape)
     assert not tool.isVisible()
+
+
+def tips(tool: ToolWindow) -> dict[QPushButton, tuple[bool, str]]:
+    """Whether each button of a tool is enabled, and its tooltip."""
+    buttons = tool.findChildren(QPushButton)
+    return {each: (each.isEnabled(), each.toolTip()) for each in buttons}
 
 
 def fill_simulator(tool: Any, qtbot: QtBot) -> None:

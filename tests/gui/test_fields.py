@@ -44,8 +44,49 @@ def test_typed_numbers_are_shown_in_full_and_computed_ones_rounded():
 def test_numbers_accept_point_or_comma_and_either_minus():
     assert parsed(" 27,5 ") == parsed("27.5") == 27.5
     assert parsed("−3") == -3
-    for text in ("", "x", "1 2", "1_0", "nan", "inf"):
+    assert parsed("0,125") == parsed("−0,125e0") * -1 == 0.125
+    assert parsed("１２，５".replace("，", ",")) == 12.5
+    for text in ("", "x", "1 2", "1_0", "nan", "inf", "5 mm", "1 000", "1.000,5", "1,000.5"):
         assert parsed(text) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "highest", "value"),
+    [
+        ("1,250", 1e4, None),
+        ("+１,２５０", 1e4, None),
+        ("1,250e1", 1e5, None),
+        ("1,250", 90, None),  # 1250 is not read as 1.25 where it is out of range
+        ("0,250", 1e4, 0.25),
+        ("1,25", 1e4, 1.25),
+        ("1.250", 1e4, 1.25),
+    ],
+)
+def test_comma_that_may_separate_thousands_is_refused(qtbot, text, highest, value):
+    field = NumberField("Distance", "mm", lowest=0, highest=highest)
+    qtbot.addWidget(field)
+    field.set_value(7.0)
+    paste(field, text)
+    field.flush()
+    assert field.value() == (7.0 if value is None else value)
+    assert (text in field.problem.text()) == (value is None)
+
+
+@pytest.mark.parametrize("text", ["1,000", "1.000", "1 000", "1,0", "1.", "１．０００", "12 px"])
+def test_whole_number_has_digits_only(qtbot, text):
+    field = NumberField("Frames", lowest=1, highest=10**9, decimals=0)
+    qtbot.addWidget(field)
+    field.set_value(7)
+    emitted = []
+    field.edited.connect(emitted.append)
+    paste(field, text)
+    field.flush()
+    assert not emitted
+    assert field.value() == 7
+    assert text in field.problem.text()
+    retype(qtbot, field, "1e3")
+    field.flush()
+    assert emitted == [1000]
 
 
 def test_csv_has_the_numbers_in_full_precision():
@@ -70,6 +111,12 @@ def retype(qtbot, field, text):
     box.setFocus()
     box.selectAll()
     qtbot.keyClicks(box, text)
+
+
+def paste(field, text):
+    QGuiApplication.clipboard().setText(text)
+    field.editor.selectAll()
+    field.editor.lineEdit().paste()
 
 
 def test_number_is_emitted_when_editing_is_finished(qtbot, number):

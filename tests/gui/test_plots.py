@@ -66,6 +66,34 @@ def test_nearest_and_next_point() -> None:
     assert next_key([current()], 3, 1) is None
 
 
+@pytest.mark.parametrize(
+    ("frames", "gaps"),
+    [
+        ([0, 1, 2, 3], []),
+        ([0, 1, 3, 4], []),
+        ([0, 1, 2, 500, 501], [500]),
+        ([0, 5, 10, 20, 40], [40]),
+        ([7], []),
+        ([], []),
+    ],
+)
+def test_line_does_not_cross_missing_frames(frames: list[int], gaps: list[int]) -> None:
+    key = np.array(frames, np.int64)
+    width = Curve("Width", "mm", 0.1 * key, np.ones(len(key)), key=key, mark=0 * key)
+    x, y = width.line
+    np.testing.assert_allclose(x[np.isnan(y)], 0.1 * np.array(gaps))
+    np.testing.assert_array_equal(x[np.isfinite(y)], width.x)
+    assert (np.diff(x) >= 0).all()
+
+
+def test_line_is_drawn_with_its_gaps(view: PlotStack) -> None:
+    key = np.array([0, 1, 2, 50, 51])
+    broken = Curve("Width", "mm", 0.1 * key, np.ones(5), key=key, mark=0 * key)
+    view.show_curves([broken], TIME)
+    _, y = view._plots[0].line.getOriginalDataset()
+    assert np.isnan(y).sum() == 1
+
+
 def test_table_for_a_spreadsheet() -> None:
     lines = as_table([curve(), curve(3, "Width", 5), current()], TIME).splitlines()
     head = "frame|Time (s)|Height (mm)|Height σ (mm)|Width (mm)|Width σ (mm)|mark".split("|")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from PySide6.QtWidgets import QCheckBox, QComboBox, QLineEdit
+from PySide6.QtWidgets import QAbstractButton, QCheckBox, QComboBox, QLineEdit
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.shell.steps import READ_ONLY, STEPS
@@ -85,3 +85,30 @@ def test_locked_fields_give_a_reason_and_unlock_with_the_session(
     assert not notes.editor.isReadOnly()
     assert [each.toolTip() for each in (height.editor, notes.editor, tick)] == tips
     assert window.menus.actions["measure"].isEnabled()
+
+
+def tips(window: MainWindow, qtbot: QtBot) -> dict[str, tuple[bool, str]]:
+    """Whether each visible button of the pages is enabled, and its tooltip."""
+    found = {}
+    for step in STEPS:
+        window.show_step(step.key)
+        qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+        for side in (window.page, window.page.panel):
+            for each in side.findChildren(QAbstractButton):
+                if each.isVisible() and each.text():
+                    found[f"{step.key}: {each.text()}"] = each.isEnabled(), each.toolTip()
+    return found
+
+
+def test_disabled_buttons_give_a_reason(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot
+) -> None:
+    path = copy_sample("gtaw")
+    window.workspace.show(Session.open(path))
+    usual = tips(window, qtbot)
+    window.workspace.show(Session.open(path, read_only=True))
+    locked = tips(window, qtbot)
+    disabled = {name for name in usual if usual[name][0] and not locked[name][0]}
+    assert {"trends: Load table…", "plane: Find O′ and the axes"} <= disabled
+    assert not {name for name in disabled if locked[name][1] == usual[name][1]}
+    assert not {name for name in disabled if READ_ONLY not in locked[name][1]}

@@ -114,6 +114,22 @@ def test_advice_equals_that_of_the_command_and_can_be_undone(
     assert QApplication.clipboard().text().startswith("quantity,unit,way")
 
 
+def test_disabled_buttons_say_why(adviser: AdviserWindow, window: MainWindow, qtbot: QtBot):
+    words = [adviser.use_button.toolTip(), adviser.save_button.toolTip()]
+    assert words == [adviser_presenter.NO_ADVICE] * 2
+    session = adviser.workspace.session
+    assert session is not None
+    adviser.ranges["pools.height_mm"].set_value((0.5, 0.6))
+    adviser.start()
+    qtbot.waitUntil(lambda: not adviser.working)
+    assert adviser.use_button.toolTip() == adviser_presenter.IMPOSSIBLE
+    path = session.path
+    window.files.close()
+    assert path.stem in adviser.use_button.toolTip()
+    with Session.open(path, read_only=True) as locked:
+        assert "read-only" in adviser_presenter.why_not_usable(locked, adviser.advice)
+
+
 def test_impossible_request_is_explained(adviser: AdviserWindow, qtbot: QtBot):
     adviser.ranges["pools.height_mm"].set_value((0.5, 0.6))
     click(adviser.start_button)

@@ -158,6 +158,36 @@ def test_cancelling_keeps_finished_parts(
     assert analysis.isVisible() == (how == "escape")
 
 
+def test_disabled_buttons_say_why(analysis: AnalysisWindow, qtbot: QtBot):
+    enabled = analysis.start_button.toolTip()
+    tick(analysis)
+    assert not analysis.start_button.isEnabled()
+    assert "Tick" in analysis.start_button.toolTip()
+    tick(analysis, "budget")
+    analysis.start()
+    assert not analysis.start_button.isEnabled()
+    assert analysis.start_button.toolTip() not in ("", enabled)
+    analysis.cancel()
+    qtbot.waitUntil(lambda: not analysis.working)
+    assert analysis.start_button.toolTip() == enabled
+    assert not analysis.cancel_button.isEnabled()
+
+
+def test_budget_of_a_former_setup_is_marked(analysis: AnalysisWindow, qtbot: QtBot):
+    tick(analysis, "budget")
+    run_analysis(analysis, qtbot)
+    assert not analysis.former.text()
+    space = analysis.workspace
+    space.attempt(lambda session: session.update_setup({"laser": {"distance_mm": 33.0}}))
+    assert "former set-up of gtaw" in analysis.former.text()
+    assert analysis.former.isVisible()
+    space.undo()
+    assert not analysis.former.text()
+    space.attempt(lambda session: session.update_setup({"laser": {"distance_mm": 33.0}}))
+    run_analysis(analysis, qtbot)
+    assert not analysis.former.text()
+
+
 def test_new_parts_replace_the_previous_ones(analysis: AnalysisWindow, qtbot: QtBot):
     run_analysis(analysis, qtbot)
     tick(analysis)

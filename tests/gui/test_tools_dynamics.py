@@ -122,6 +122,8 @@ def test_stopped_analysis_of_changed_results_keeps_the_warning(
     corrected = delete_dots(Correction.of(found.dots, found.lattice), [0])
     assert window.workspace.attempt(lambda of: of.correct({3: corrected}))
     assert tool.words.text().startswith(CHANGED)
+    assert not tool.save_button.isEnabled()
+    assert tool.save_button.toolTip() == CHANGED
     tool.start()
     tool.reject()
     qtbot.waitUntil(lambda: not tool.working)

@@ -447,11 +447,24 @@ def test_copied_session_finds_its_recording(
     assert "is there already" in problems(plain)[0]
 
 
+def test_actions_are_of_the_present_state(plain: MainWindow, copy_sample: CopySample):
+    plain.files.open(copy_sample("gtaw"))
+    page = plain_page(plain)
+    plain._rest.start(60_000)  # the display of a change is due later
+    plain.workspace.changed.emit()
+    before = page.refreshed
+    plain.do("undo")
+    assert page.refreshed == before
+    plain.do("copy_picture")
+    assert page.refreshed == before + 1
+
+
 def test_copy_needs_a_valid_new_name(copy_sample: CopySample, tmp_path: Path):
     path = copy_sample("thumb_tack")
     for bad in (path, tmp_path / "copy.txt", tmp_path / "no" / "folder.labsession"):
-        with pytest.raises(InputError):
+        with pytest.raises(InputError) as refused:
             copy_session(path, bad)
+        assert "Errno" not in str(refused.value)
     assert not (tmp_path / "no").exists()
 
 

@@ -295,6 +295,29 @@ def test_pool_beyond_a_limit_and_darkness_raise_alarms(setup: Setup, events: Eve
         watch.close()
 
 
+def test_changed_setup_replaces_the_results(watch: LiveWatch, events: Events, setup: Setup):
+    former = prepare(watch, {1: 7.2})
+    watch.measure(frame(1))
+    assert [alarm.code for alarm in watch.alarms.shown] == ["width-high"]
+
+    def replaced_meanwhile(given: CameraFrame, drawn: bool) -> LiveResult | None:
+        watch.set_setup(setup, Settings())
+        prepare(watch, {3: 6.5})
+        return Prepared.measure(former, given, drawn)
+
+    former.measure = replaced_meanwhile  # type: ignore[method-assign]
+    watch.measure(frame(2))
+    assert watch.newest() is None
+    assert watch.trend.over(60, Limits()).number.tolist() == []
+    assert [alarm.code for alarm in watch.alarms.shown] == ["width-high"]  # until it is measured
+    watch.measure(frame(3))
+    assert watch.trend.over(60, Limits()).number.tolist() == [3]
+    assert "set-up" in events[-2][0].words
+    watch.set_setup(None, Settings())
+    watch.measure(frame(4))
+    assert watch.newest() is None
+
+
 @pytest.mark.skipif(not hasattr(os, "nice"), reason="the system knows no niceness")
 def test_measuring_process_has_normal_priority(setup: Setup):
     """With a lower priority, its results could be a minute old on a busy machine."""

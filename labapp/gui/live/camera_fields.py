@@ -100,6 +100,12 @@ class CameraFields(QObject):
         self.fields["gain_db"].unit.setText(feed.camera.limits.gain_unit)
         self._show(feed.settings, feed.camera.limits)
 
+    def set_calibrated(self, calibrated: tuple[int, int] | None) -> None:
+        """Compare the frames with another picture of calibration, see `show_camera`."""
+        self._calibrated = calibrated
+        if self._feed is not None and not self.waiting:
+            self._show(self._feed.settings, self._feed.camera.limits)
+
     def set_recording(self, recording: bool) -> None:
         """Prevent changes of the frame size during a recording."""
         why = "Not while it records: a recording's frames are of one size"
@@ -209,7 +215,8 @@ def region_of(text: str) -> Region:
     InputError
         If they are not four whole numbers.
     """
-    found = re.fullmatch(r"\s*(\d{1,6})" + r"[\s,;]+(\d{1,6})" * 3 + r"\s*", text)
+    number = r"(0|[1-9]\d{0,5})"  # "024" is the rest of "1 024"
+    found = re.fullmatch(rf"\s*{number}" + rf"[\s,;]+{number}" * 3 + r"\s*", text)
     if found is None:
         expected = "four whole numbers: left, top, width, height (px)"
         raise InputError("camera", "region", text.strip(), expected)

@@ -164,12 +164,22 @@ class Live:
             if not self._closing.is_set():
                 self.feed = feed
                 self._recorders = [self._recorder(feed)]
-                if self.setup is not None and self._settings is not None:
-                    given = (self.setup, self._settings, feed.bit_depth, self._limits)
-                    self.watch = LiveWatch(self.name, *given, self._say)
                 self._begin_work()
+                self._begin_measuring(feed)
                 return
         feed.stop()
+
+    def set_setup(self, setup: Setup | None, settings: Settings) -> None:
+        """Measure the next frames with another set-up or other settings; None: measure none."""
+        with self._turn:
+            if self.feed is None or self._closing.is_set():
+                return
+            self.setup, self._settings = setup, settings
+            self._dots = settings.dots
+            if self.watch is None:
+                self._begin_measuring(self.feed)
+            else:
+                self.watch.set_setup(setup, settings)
 
     def close(self) -> None:
         """End the recording, write all of it, and release the camera. May be called twice."""
@@ -229,14 +239,23 @@ class Live:
             ("dots", partial(newest_of, self._to_show), self._find_quickly, SHOW_S, 1.0),
             ("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S, 1.0),
         ]
-        if self.watch is not None:
-            # No pause: the work runs in a process, and skipped frames would lengthen the steps.
-            works.append(("figures", self.watch.next_frame, self.watch.measure, 0.0, 0.0))
         for work in works:
-            name = f"live {work[0]}"
-            worker = threading.Thread(target=self._work_on, args=work, name=name, daemon=True)
-            self._workers.append(worker)
-            worker.start()
+            self._begin(work)
+
+    def _begin_measuring(self, feed: Feed) -> None:
+        if self.setup is None or self._settings is None:
+            return
+        given = (self.setup, self._settings, feed.bit_depth, self._limits)
+        self.watch = LiveWatch(self.name, *given, self._say)
+        # No pause: the work runs in a process, and skipped frames would lengthen the steps.
+        self._begin(("figures", self.watch.next_frame, self.watch.measure, 0.0, 0.0))
+
+    def _begin(self, work: _Work) -> None:
+        """Start a thread for a work."""
+        name = f"live {work[0]}"
+        worker = threading.Thread(target=self._work_on, args=work, name=name, daemon=True)
+        self._workers.append(worker)
+        worker.start()
 
     def _work_on(
         self,

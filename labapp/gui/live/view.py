@@ -9,6 +9,7 @@ from functools import partial
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 
 from labapp.core.images.exposure import Exposure
+from labapp.core.pipeline import Settings
 from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
 from labapp.gui.live.camera_fields import CameraFields, calibrated_px
@@ -100,6 +101,8 @@ class LiveView(QObject):
         self._finding: Task | None = None
         self._status_s = self.measured_s = 0.0
         self._result: LiveResult | None = None
+        self._basis: tuple[str, Settings] | None = None
+        """Set-up, as text, and settings of the measuring."""
         self._timer = QTimer(self, interval=TICK_MS)
         self._timer.timeout.connect(self._tick)
         self._rings = rings()
@@ -109,6 +112,7 @@ class LiveView(QObject):
         self._make_group()
         self.bar = RecordBar(self.trigger, self.mark, self.stop)
         workspace.changed.connect(self._set_limits)
+        workspace.changed.connect(self._follow_session)
         workspace.changed.connect(self._show_state)
         workspace.closing.connect(self._session_closes)
         workspace.tasks.changed.connect(self._show_state)
@@ -148,6 +152,7 @@ class LiveView(QObject):
         chosen = self.camera.value()
         name = dict(self._choices)[chosen]
         folder, stem = self.workspace.folder, session.path.stem
+        self._basis = session.setup_text, session.settings
         live = Live(
             name,
             lambda: recording_path(folder, stem),
@@ -202,19 +207,39 @@ class LiveView(QObject):
         self.camera_fields.show_camera(
             live.feed, None if session is None else calibrated_px(session)
         )
-        self.penetration.begin()
-        self.penetration.setVisible(live.watch is not None)
         self._rings.setData([])
-        self.measured_s, self._result = 0.0, None
-        self.figures.show_figures(figures(None) if live.watch is not None else ())
-        self.figures.words.setText("" if live.watch or session is None else why_unmeasured(session))
-        self.figures.setup_words.setText("")
-        self.canvas.set_live(live.watch is not None)
+        self._begin_figures(live)
+        self._follow_session()
         self._rings.show()
         self._timer.start(TICK_MS)
         self._show_state()
         # Here Space records, also as the key of the focused widget.
         self.bar.record_button.setFocus()
+
+    def _begin_figures(self, live: Live) -> None:
+        """Show that nothing is measured yet, or why nothing is."""
+        session, is_measured = self.workspace.session, live.setup is not None
+        self.penetration.begin()
+        self.penetration.setVisible(live.watch is not None)
+        self.measured_s, self._result = 0.0, None
+        self.figures.show_figures(figures(None) if is_measured else ())
+        self.figures.words.setText(
+            "" if is_measured or session is None else why_unmeasured(session)
+        )
+        self.figures.setup_words.setText("")
+        self.canvas.set_live(live.watch is not None)
+
+    def _follow_session(self) -> None:
+        """Measure with the session's set-up and settings, which may have changed."""
+        session, live = self.workspace.session, self.live
+        if session is None or live is None or not live.is_open:
+            return
+        basis = session.setup_text, session.settings
+        if basis != self._basis:
+            self._basis = basis
+            live.set_setup(setup_of(session), session.settings)
+            self.camera_fields.set_calibrated(calibrated_px(session))
+            self._begin_figures(live)
 
     def stop(self) -> None:
         """Stop the camera after finishing a current recording."""
@@ -399,12 +424,13 @@ class LiveView(QObject):
         self.counts.setText(live.counts_text())
         if live.watch is not None:
             pace, skipped = live.watch.trend.pace(), live.watch.queue.skipped
-            self._show_figures(live.watch)
-            self.figures.words.setText(
-                pace_text(self._result, pace, live.rate_hz(), self._age_s, skipped)
-            )
-            checked = "" if live.setup is None else live.setup.check_date
-            self.figures.setup_words.setText(live_setup_words(self._result, checked))
+            if live.setup is not None:
+                self._show_figures(live.watch)
+                self.figures.words.setText(
+                    pace_text(self._result, pace, live.rate_hz(), self._age_s, skipped)
+                )
+                checked = live.setup.check_date
+                self.figures.setup_words.setText(live_setup_words(self._result, checked))
             self.canvas.show_status(live.watch)
         picture = self._picture.picture
         if live.feed is not None and picture is not None:

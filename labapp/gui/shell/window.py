@@ -171,7 +171,9 @@ class MainWindow(QMainWindow):
     # --- actions ----------------------------------------------------------------------------
 
     def do(self, name: str) -> None:
-        """Run an action of the menus."""
+        """Run an action of the menus, on what is shown."""
+        if name not in ("undo", "redo"):  # their keys may be held down
+            self._rested()
         self._commands[name]()
         self._show_actions()
 

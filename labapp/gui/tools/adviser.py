@@ -9,10 +9,10 @@ from PySide6.QtWidgets import QTabWidget, QVBoxLayout, QWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import adviser_presenter as presenter
-from labapp.gui.tools.tool import ToolWindow, progress_of
+from labapp.gui.tools.tool import WORKING, ToolWindow, progress_of
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
-from labapp.gui.widgets.labels import allow, heading, wrapping_label
+from labapp.gui.widgets.labels import heading, wrapping_label
 from labapp.gui.widgets.layouts import Group, fill, scrolled
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.sheet import Sheet
@@ -50,10 +50,6 @@ NUMBERS = (
     ("bench.edge_mm", "Edge", 0, 50, 0.5, "How far dots stay within the plane's edges"),
     ("bench.electrode_height_mm", "Electrode height", 0, 50, 0.5, "Work piece to the tip"),
 )
-
-
-START_TIP = "Search for the set-up with the least error of the height"
-USE_TIP = "Apply this set-up to the session; undo restores the former one"
 
 
 class AdviserWindow(ToolWindow):
@@ -116,11 +112,11 @@ class AdviserWindow(ToolWindow):
             "Save the advice…", "Write words, tables, picture and set-up file to a folder"
         )
         self.use_button = self.add_button(
-            "Apply",
-            USE_TIP,
-            self.use,
+            "Apply", "Apply this set-up to the session; undo restores the former one", self.use
         )
-        self.start_button = self.add_button("Advise", START_TIP, self.start)
+        self.start_button = self.add_button(
+            "Advise", "Search for the set-up with the least error of the height", self.start
+        )
 
     # --- asking ------------------------------------------------------------------------------
 
@@ -213,13 +209,9 @@ class AdviserWindow(ToolWindow):
             other = presenter.why_not_applied(session, advice, self._sought_for)
             words = presenter.headline(advice)
         self.headline.setText(" ".join(filter(None, (lines, other, words))))
-        allow(self.start_button, START_TIP, lines)
-        self.start_button.setEnabled(not self.working and not lines)
-        allow(self.use_button, USE_TIP, lines or other)
-        writable = session is not None and not session.read_only
-        possible = writable and advice is not None and advice.possible
-        self.use_button.setEnabled(possible and not lines and not other)
-        self.save_button.setEnabled(bool(self.files))
+        self.offer(self.start_button, lines or (WORKING if self.working else ""))
+        self.offer(self.use_button, lines or other or presenter.why_not_usable(session, advice))
+        self.offer(self.save_button, "" if self.files else presenter.NO_ADVICE)
 
     def use(self) -> None:
         """Use the recommended set-up in the session."""

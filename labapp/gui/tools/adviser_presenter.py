@@ -8,6 +8,7 @@ from typing import Any
 from labapp.config.setup import pattern_values
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.setup.presenter import rig
+from labapp.gui.shell.steps import read_only
 from labapp.session.session import Session
 from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM
 from labapp.studies.adviser.bench_limits import CONSTRAINTS, BenchLimits
@@ -22,6 +23,10 @@ ABOUT = 0.1
 """Relative range of pool sizes around that of the session."""
 
 LINES = "The session is of a line pattern, and the adviser plans a bench for a pattern of dots."
+
+NO_ADVICE = "There is no advice yet: press Advise"
+
+IMPOSSIBLE = "No set-up is possible within the limits: widen them, or expect smaller pools"
 
 Values = dict[str, dict[str, Any]]
 """Table → key → value, as required by `studies.adviser.keys.parse_request`."""
@@ -99,6 +104,15 @@ def why_not_applied(session: Session | None, advice: Advice, sought_for: Path | 
     if found is not None and pattern_values(found.pattern) != pattern_values(advice.limits.pattern):
         return "This advice was sought for another pattern: press Advise again."
     return ""
+
+
+def why_not_usable(session: Session | None, advice: Advice | None) -> str:
+    """Reason why an advice cannot be applied, whatever it was sought for; empty if it can."""
+    if session is None:
+        return "Open a session first: the advised set-up is for its measurement"
+    if advice is None:
+        return NO_ADVICE
+    return read_only(session) or ("" if advice.possible else IMPOSSIBLE)
 
 
 def headline(advice: Advice) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
@@ -10,9 +11,9 @@ from PySide6.QtWidgets import QCheckBox, QSizePolicy, QStackedWidget, QWidget
 from labapp.gui.tasks import Control
 from labapp.gui.tools import analysis_presenter as presenter
 from labapp.gui.tools.analysis_presenter import BUDGET, OPENED, PARTS, USUAL
-from labapp.gui.tools.tool import ToolWindow, progress_of
+from labapp.gui.tools.tool import WORKING, ToolWindow, progress_of
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, flush_fields, whole
-from labapp.gui.widgets.labels import allow, heading, show_words, wrapping_label
+from labapp.gui.widgets.labels import heading, show_words, wrapping_label
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 from labapp.studies import SCHEME_NAMES
@@ -37,9 +38,6 @@ SIZES = (
 )
 
 
-START_TIP = "Compute what is ticked; each part is shown when it is done"
-
-
 class AnalysisWindow(ToolWindow):
     """Computes parts of chapter 8 and the uncertainty budget of a set-up, and shows each result."""
 
@@ -51,6 +49,7 @@ class AnalysisWindow(ToolWindow):
         self.pictures: dict[str, bytes] = {}
         """Pictures of the last run, by name."""
         self._anew = False
+        self._of: presenter.SetupOf | None = None
         self._basis: object = None
         super().__init__(sessions, window)
 
@@ -107,9 +106,10 @@ class AnalysisWindow(ToolWindow):
             "the ± of the session's set-up, or 0.1 mm, 0.1° and 0.1 px if it has none; the other "
             "parts assume these. A dot is known to 0.3 px."
         )
-        self.why = wrapping_label()
-        self.why.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
-        self.why.hide()
+        self.why, self.former = wrapping_label(), wrapping_label()
+        for label in (self.why, self.former):
+            label.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
+            label.hide()
         self.words.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.table = CellTable("Table of the error analysis")
         self.sheet = Sheet("Picture of the error analysis")
@@ -117,6 +117,7 @@ class AnalysisWindow(ToolWindow):
         for widget in (self.table, self.sheet):
             self.stack.addWidget(widget)
         self.results.addWidget(self.why)
+        self.results.addWidget(self.former)
         self.results.addWidget(line)
         self.results.addWidget(self.words)
         self.results.addWidget(self.stack, 1)
@@ -128,7 +129,9 @@ class AnalysisWindow(ToolWindow):
         self.add_save_button(
             "Save the results…", "Write all tables (CSV, Markdown) and pictures to a folder"
         )
-        self.start_button = self.add_button("Run", START_TIP, self.start)
+        self.start_button = self.add_button(
+            "Run", "Compute what is ticked; each part is shown when it is done", self.start
+        )
 
     # --- what is to be worked out --------------------------------------------------------------
 
@@ -164,6 +167,8 @@ class AnalysisWindow(ToolWindow):
         budget = self.workspace.run_or_report(self._budget) if BUDGET in ticked else None
         if BUDGET in ticked and budget is None:
             return
+        is_own = budget is not None and budget[0] is not None
+        of = presenter.setup_of(self.workspace.session) if is_own else None
 
         def work(control: Control) -> None:
             if budget is not None:
@@ -172,7 +177,7 @@ class AnalysisWindow(ToolWindow):
                 control.part(made)
 
         self._anew = True
-        self.begin("Computing", work, lambda _: self.say("Done"), self.show_part)
+        self.begin("Computing", work, lambda _: self.say("Done"), partial(self.show_part, of=of))
 
     def _why_not(self) -> str:
         """Reason why what is ticked cannot be computed; empty if it can."""
@@ -192,9 +197,13 @@ class AnalysisWindow(ToolWindow):
 
     # --- what came out -------------------------------------------------------------------------
 
-    def show_part(self, made: AnalysisPart) -> None:
-        """Show the results of a part; the first one replaces those of an earlier run."""
+    def show_part(self, made: AnalysisPart, of: presenter.SetupOf | None = None) -> None:
+        """Show the results of a part; the first one replaces those of an earlier run.
+
+        ``of``: the session's set-up for which the budget is; None for another one.
+        """
         if self._anew:
+            self._of = of
             self.tables, self.pictures, self.files = {}, {}, {}
             self._anew = False
         self.tables |= {table.name: table for table in made.tables}
@@ -224,6 +233,7 @@ class AnalysisWindow(ToolWindow):
         """Enable the actions that are available now."""
         ticked, why = any(box.isChecked() for box in self.parts.values()), self._why_not()
         show_words(self.why, why)
-        allow(self.start_button, START_TIP, why)
-        self.start_button.setEnabled(ticked and not self.working and not why)
-        self.save_button.setEnabled(bool(self.files))
+        show_words(self.former, presenter.of_former_setup(self.workspace.session, self._of))
+        unticked = "" if ticked else "Tick what is to be computed"
+        self.offer(self.start_button, why or unticked or (WORKING if self.working else ""))
+        self.offer(self.save_button, "" if self.files else "There are no results yet: press Run")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 from labapp.session.session import Session
 from labapp.studies import SCHEME_NAMES
@@ -41,6 +42,9 @@ USUAL_MM = (6.0, 7.0, 0.3)
 """Width, length and height of the pool if none is expected, mm."""
 
 
+SetupOf = tuple[Path, str]
+"""A session's file, and its set-up as text."""
+
 LINES = (
     "The session is of a line pattern, which has no error budget: take the set-up of §8.3.1, or "
     "open a session of dots."
@@ -55,6 +59,24 @@ def has_setup(session: Session | None) -> bool:
 def why_no_budget(session: Session | None, setup: str) -> str:
     """Reason why the chosen set-up has no budget; empty if it may have one."""
     return LINES if setup == OPENED and session is not None and session.has_lines else ""
+
+
+def setup_of(session: Session | None) -> SetupOf | None:
+    """File and set-up, as text, of a session."""
+    return None if session is None else (session.path, session.setup_text)
+
+
+def of_former_setup(session: Session | None, of: SetupOf | None) -> str:
+    """Text about a budget for another set-up than the session's; empty if it is for this one.
+
+    Parameters
+    ----------
+    of
+        Set-up for which the budget is; None if it is not that of a session.
+    """
+    if of is None or of == setup_of(session):
+        return ""
+    return f"▲ The budget is for the former set-up of {of[0].stem}: press Run for the present one."
 
 
 def expected_mm(session: Session | None) -> tuple[float, float, float]:

@@ -12,10 +12,10 @@ from PySide6.QtWidgets import QAbstractItemView, QSizePolicy, QTabWidget, QWidge
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import dynamics_presenter as presenter
-from labapp.gui.tools.tool import ToolWindow
+from labapp.gui.tools.tool import WORKING, ToolWindow
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
-from labapp.gui.widgets.labels import heading, wrapping_label
+from labapp.gui.widgets.labels import allow, heading, wrapping_label
 from labapp.gui.widgets.layouts import column_of, hbox
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 FILM_MS = 80
 """Interval of the pictures in the film of a mode."""
+
+PLAY_TIP = "Show one period of this mode as a film; press again to stop"
+FRAME_TIP = "Show the frame of this event in the main window"
 
 CHANGED = "Results or signals have changed since: press Analyse again."
 
@@ -79,12 +82,8 @@ class DynamicsWindow(ToolWindow):
         self.shape = Sheet("Shape and course of the mode")
         self.modes, self.events = CellTable("Modes"), CellTable("Events")
         self.responses = CellTable("Responses")
-        self.play_button = button(
-            "Play", "Show one period of this mode as a film; press again to stop", self.play
-        )
-        self.frame_button = button(
-            "Show the frame", "Show the frame of this event in the main window", self.show_frame
-        )
+        self.play_button = button("Play", PLAY_TIP, self.play)
+        self.frame_button = button("Show the frame", FRAME_TIP, self.show_frame)
         for table, changed in (
             (self.modes, self._show_mode),
             (self.events, self.show_state),
@@ -296,11 +295,15 @@ class DynamicsWindow(ToolWindow):
         seen = None if present is None else present.seen
         why = presenter.impossible(self.workspace.session, seen)
         text = why or (presenter.range_text(seen) if seen is not None else "")
-        if self.drawn is not None and not presenter.same_results(present, self._of):
+        changed = self.drawn is not None and not presenter.same_results(present, self._of)
+        if changed:
             text = f"{CHANGED} {text}"
         self.words.setText(text)
-        idle = not self.working
-        self.start_button.setEnabled(idle and not why)
-        self.save_button.setEnabled(idle and self.drawn is not None)
-        self.play_button.setEnabled(idle and self.modes.currentRow() >= 0)
-        self.frame_button.setEnabled(bool(self.events.selectedItems()))
+        working = WORKING if self.working else ""
+        drawn = "" if self.drawn is not None else "There are no results yet: press Analyse"
+        self.offer(self.start_button, why or working)
+        self.offer(self.save_button, drawn or working or (CHANGED if changed else ""))
+        chosen = "" if self.modes.currentRow() >= 0 else "Select a mode in the table"
+        allow(self.play_button, PLAY_TIP, chosen or working)
+        chosen = "" if self.events.selectedItems() else "Select an event in the table"
+        allow(self.frame_button, FRAME_TIP, chosen)

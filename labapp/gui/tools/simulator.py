@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from labapp.gui.dialogs import ask_file, ask_folder, new_path
 from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import simulator_presenter as presenter
 from labapp.gui.tools.simulator_presenter import ScenarioPreview
-from labapp.gui.tools.tool import ToolWindow, progress_of
+from labapp.gui.tools.tool import WORKING, ToolWindow, progress_of
 from labapp.gui.views.picture import PictureView, rings
 from labapp.gui.widgets.fields import ChoiceField, flush_fields, whole
 from labapp.gui.widgets.labels import heading, wrapping_label
@@ -189,8 +190,11 @@ class SimulatorWindow(ToolWindow):
 
     def show_state(self) -> None:
         """Enable the actions that are available now."""
-        self.start_button.setEnabled(not self.working and self.preview is not None)
-        self.open_button.setEnabled(not self.working and self.made is not None)
+        working = WORKING if self.working else ""
+        drawn = "" if self.preview is not None else "The first frame of the scenario is not drawn"
+        self.offer(self.start_button, drawn or working)
+        written = "" if self.made is not None else "Simulate a recording first"
+        self.offer(self.open_button, written or working)
 
     def start(self) -> None:
         """Write recording and true values in the background; the folder is complete or absent."""
@@ -200,7 +204,7 @@ class SimulatorWindow(ToolWindow):
         if not self.folder.value().strip():
             self.say("Enter a folder first, or choose one", True)
             return
-        folder = Path(self.folder.value().strip()).expanduser().absolute()
+        folder = Path(os.path.expanduser(self.folder.value().strip())).absolute()
 
         def work(control: Control) -> Scenario:
             scenario = read_scenario(path, frames, seed)

@@ -16,7 +16,7 @@ from labapp.gui.dialogs import SETUP_FILES, ask_file, ask_folder, ask_save, drop
 from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import study_presenter as presenter
 from labapp.gui.tools.study_sessions import BegunSession, begin_session, must_be_closed
-from labapp.gui.tools.tool import ToolWindow, progress_of
+from labapp.gui.tools.tool import WORKING, ToolWindow, progress_of
 from labapp.gui.widgets.fields import (
     ChoiceField,
     FieldForm,
@@ -431,9 +431,12 @@ class StudyWindow(ToolWindow):
 
     def show_state(self) -> None:
         """Enable the actions that are available now."""
-        self.start_button.setEnabled(self.study is not None and not self.working)
-        self.open_button.setEnabled(self.selected() is not None and not self.working)
-        self.page_button.setEnabled(self.summary is not None)
+        working = WORKING if self.working else ""
+        chosen = "" if self.study is not None else "Open a study first, or make one"
+        self.offer(self.start_button, chosen or working)
+        selected = "" if self.selected() is not None else "Select a recording in the table"
+        self.offer(self.open_button, selected or working)
+        self.offer(self.page_button, "" if self.summary is not None else "There are no results yet")
 
 
 def _results(path: Path, folder: Path, surfaces: bool) -> StudySummary:

@@ -311,7 +311,7 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
     def show_curve(self, curve: Curve) -> None:
         """Show a curve."""
         self._curve = curve
-        self.line.setData(curve.x, curve.y)
+        self.line.setData(*curve.line)
         self.level.setVisible(bool(np.isfinite(curve.level)))
         if np.isfinite(curve.level):
             self.level.setValue(curve.level)

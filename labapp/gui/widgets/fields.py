@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from labapp.gui.digits import entered, parsed
+from labapp.gui.digits import entered, parsed, with_thousands
 from labapp.gui.widgets.labels import plain_label, plain_tip, show_words, wrapping_label
 from labapp.gui.widgets.layouts import hbox, vbox
 
@@ -197,9 +197,15 @@ class NumberField(Field):
         kept = self._shown(self._value) or "nothing"
         if not text.strip():
             return None, "" if self.optional else f"A number is needed; {kept} stays"
+        if self.decimals == 0 and not {".", ","}.isdisjoint(text):  # they may separate thousands
+            return None, f"“{text.strip()}” is not a whole number in digits only; {kept} stays"
         value = parsed(text)
         if value is None:
             return None, f"“{text.strip()}” is not a number; {kept} stays"
+        other = with_thousands(text)
+        if other is not None:
+            words = f"“{text.strip()}” can be {value:.7g} or {other:.7g}: write it without a comma"
+            return None, f"{words}; {kept} stays"
         if not self.lowest <= value <= self.highest:
             low, high = (entered(end, 0) for end in (self.lowest, self.highest))
             words = f"from {low} to {high} {self.unit.text()}".strip()

@@ -73,7 +73,8 @@ class NumpyStack(StoredFrames):
                 with path.open("rb") as file:
                     self._frames, claimed = _map_array(path, file, 0, file_size(path))
         except OSError as error:
-            raise InputError(path, "file", error, "a file that may be read") from error
+            why = error.strerror or error
+            raise InputError(path, "file", why, "a file that may be read") from error
         count, rows, columns = self._frames.shape[:3]
         self.warnings = ends_early(path.name, claimed, count)
         kind = self._frames.dtype

@@ -213,6 +213,9 @@ def test_region_text_round_trip():
     assert region_of(region_text((8, 4, 32, 20))) == (8, 4, 32, 20)
     with pytest.raises(InputError, match="four whole numbers"):
         region_of("1.5, 2, 3, 4")
+    for thousand in ("1 024", "1,024"):
+        with pytest.raises(InputError):
+            region_of(f"0, 0, {thousand}")
 
 
 # --- cost of recording ----------------------------------------------------------------------------

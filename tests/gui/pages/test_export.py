@@ -29,6 +29,7 @@ from labapp.gui.pages.export.presenter import (
     write,
 )
 from labapp.gui.pages.export.sizes import estimated_bytes
+from labapp.gui.pages.surface.presenter import with_scheme
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.text import SETUP_MARKS
@@ -318,6 +319,38 @@ def test_export_button_is_disabled_with_the_reason(page: ExportPage) -> None:
         box.setChecked(False)
     assert "Tick what" in page.answer.text()
     assert not page._boxes["solid"].isEnabled()
+
+
+def test_export_is_of_the_scheme_in_view(page: ExportPage, tmp_path: Path) -> None:
+    page.workspace.changed.disconnect()  # as if the window delayed the display of a change
+    page.folder.set_value(str(tmp_path / "out"))
+    session = session_of(page)
+    own = session.settings
+    session.set_settings(with_scheme(own, "ers"))
+    session.measure([0])
+    page.export_button.click()
+    assert not page.workspace.tasks.active
+    assert "scheme" in page.answer.text()
+    page.refresh()
+    session.undo()
+    assert session.settings == own
+    page.export_button.click()
+    assert not page.workspace.tasks.active
+
+
+@pytest.mark.parametrize("typed", ["", "   ", "{}", "  {}  "])
+def test_folder_without_a_name_is_the_proposed_one(
+    page: ExportPage, qtbot: QtBot, tmp_path: Path, typed: str
+) -> None:
+    page.which.edited.emit("view")
+    page.folder.editor.setText(typed.format(tmp_path / "out"))
+    page.folder.flush()
+    page.export_button.click()
+    qtbot.waitUntil(lambda: page.written is not None)
+    named = tmp_path / "out" if "{" in typed else proposed_folder(session_of(page))
+    assert page.written is not None
+    assert page.written.folder == named
+    assert page.folder.value().strip() == str(named)
 
 
 def test_every_control_has_a_tooltip(page: ExportPage) -> None:

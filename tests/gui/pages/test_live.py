@@ -8,6 +8,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -390,6 +391,33 @@ def test_large_figures_are_shown_if_the_setup_is_complete(
     qtbot.waitUntil(lambda: "Height" in [each.text() for each in labels])
     qtbot.waitUntil(lambda: any("±" in each.text() for each in labels))
     assert {"Width", "Length", "Height", "mm"} <= {each.text() for each in labels}
+
+
+def test_figures_are_of_the_present_setup(
+    window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    with open_source(SAMPLES / "gtaw" / "recording.avi") as video:
+        image = video.frame(0).image
+    camera = SimulatedDevice("pool", lambda _: image, rate_hz=4)
+    monkeypatch.setattr(live_view, "pool_camera", lambda *_: camera)
+    start(page, qtbot)
+    view, text = page.live_view, (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
+    assert view.live.watch is None
+    heights = []
+    for setup in (text, text.replace("distance_mm = 50.0", "distance_mm = 50.5")):
+        window.workspace.attempt(partial(Session.set_setup, text=setup))
+        assert view._result is None
+        qtbot.waitUntil(lambda: view._result is not None)
+        heights.append(view._result.measurement.measures.height_mm)
+    assert abs(heights[1] - heights[0]) > 1e-4
+    for _ in heights:
+        window.workspace.undo()
+    assert view.figures.words.text().startswith("Sizes are shown here once")
+    updates = view.updates
+    qtbot.waitUntil(lambda: view.updates > updates + 3)
+    assert view.figures.words.text().startswith("Sizes are shown here once")
+    window.workspace.redo()
+    qtbot.waitUntil(lambda: view._result is not None)
 
 
 @pytest.mark.parametrize("sample", ["five_lines", "gmaw"])

@@ -297,6 +297,23 @@ def test_dimension_entered_in_the_drawing_updates_it(
     assert box.field.value() == value
 
 
+@pytest.mark.parametrize("key", list(DRAWN))
+def test_refusal_in_the_drawing_can_be_read(qtbot: QtBot, page: SetupPage, key: str) -> None:
+    page.bench.resize(900, 640)
+    let_draw()
+    box = page.bench.boxes[key]
+    before = box.geometry()
+    retype(qtbot, box.field, "1,250")
+    let_draw()
+    assert box.field.problem.isVisible()
+    assert box.plot.rect().contains(box.geometry())
+    middle = box.field.problem.mapTo(box.plot, box.field.problem.rect().center())
+    assert box.isAncestorOf(box.plot.childAt(middle))  # no other box covers it
+    retype(qtbot, box.field, box.field.editor.text())
+    let_draw()
+    assert box.geometry() == before
+
+
 def assert_nothing_overlaps(page: SetupPage) -> None:
     """Check the fields of the drawing as drawn: against each other, names, torch and axes."""
     let_draw()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import (
+    QAbstractButton,
     QGridLayout,
     QHeaderView,
     QSizePolicy,
@@ -47,11 +48,13 @@ class MeasureLead(QStackedWidget):
         for words, names in LEADS:
             self.addWidget(Group(words, action_grid(names, do), 1))
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
+        self._tips = {each: each.toolTip() for each in self.findChildren(QAbstractButton)}
 
     def offer(self, without_setup: bool, why_not: str) -> None:
         """Offer one of the two; disabled if neither is possible."""
         self.setCurrentIndex(int(without_setup))
-        allow(self, "", why_not)
+        for each, tip in self._tips.items():
+            allow(each, tip, why_not)
 
 
 class DotsPanel(QWidget):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,6 +41,10 @@ from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.text import format_bytes, pluralize
+
+OPEN = "Show what was exported in the file manager"
+
+CHANGED = "The scheme has just changed: see what will be written now, and press Export again"
 
 WHICH = (
     ("all", "all that are measured"),
@@ -80,8 +85,7 @@ class ExportPage(Page):
             if self.request.which == "view":
                 self._show_plan(session)
             return
-        if not self.folder.value():
-            self.folder.set_value(str(proposed_folder(session)))
+        self._propose_folder()
         self.scheme.set_choices(schemes(session))
         self.request = replace(self.request, scheme=self.scheme.value())
         if len(session.frames) and not self.request.last:
@@ -152,7 +156,8 @@ class ExportPage(Page):
         self.again_button.setVisible(again)
         self.again_button.setEnabled(again and not measuring)
         self.again_button.setText("Measuring…" if measuring else f"Measure {len(made.again)} now")
-        self.open_button.setEnabled(self.written is not None)
+        unwritten = "" if self.written is not None else "Nothing has been exported yet"
+        allow(self.open_button, OPEN, unwritten)
 
     def _session_opened(self) -> None:
         self.written = self.plan = self._in_view = None
@@ -186,9 +191,14 @@ class ExportPage(Page):
                 box.setChecked(on)
         self._ticked()
 
+    def _propose_folder(self) -> None:
+        """Show the default folder if none is entered."""
+        if not self.folder.value().strip():
+            self.folder.set_value(str(proposed_folder(self.session)))
+
     def choose_folder(self) -> None:
         """Ask for a folder; use a new subfolder if it contains something else."""
-        here = Path(self.folder.value() or proposed_folder(self.session))
+        here = Path(self.folder.value().strip() or proposed_folder(self.session))
         if folder := ask_folder(self, "Export folder", here.parent):
             self.folder.set_value(str(folder_within(folder, self.session)))
 
@@ -199,10 +209,16 @@ class ExportPage(Page):
 
     def export(self) -> None:
         """Export the ticked items in the background."""
-        session, made, request = self.session, self.plan, self.request
+        session, shown = self.session, self.plan
+        self._show_plan(session)  # the window may show a change with a delay
+        made, request = self.plan, self.request
         if made is None or made.why_not:
             return
-        folder = Path(self.folder.value() or proposed_folder(session)).expanduser()
+        if shown is None or made.scheme != shown.scheme:
+            self._say(f"{PROBLEM} {CHANGED}")
+            return
+        name = self.folder.value().strip() or proposed_folder(session)
+        folder = Path(os.path.expanduser(name))  # `Path.expanduser` raises for an unknown user
         if not folder.is_absolute():
             folder = folder_of(session) / folder
         frames = made.frames.tolist()
@@ -305,6 +321,7 @@ class ExportPage(Page):
             "Folder",
             tooltip="A new or empty folder, or an earlier export, which is replaced",
         )
+        self.folder.edited.connect(lambda _: self._propose_folder())
         choose = button("Choose folder…", "Choose where to write", self.choose_folder)
         self.notes = wrapping_label()
         self.again_button = button(
@@ -314,8 +331,7 @@ class ExportPage(Page):
         )
         keep_room(self.again_button)
         self.export_button = button("Export", "", self.export)
-        tip = "Show what was exported in the file manager"
-        self.open_button = button("Open the folder", tip, self.open_folder)
+        self.open_button = button("Open the folder", OPEN, self.open_folder)
         # The buttons are above the text, whose height varies.
         fill(
             self.panel_layout,

@@ -36,6 +36,8 @@ SEVERAL = "The mean of several readings: change them in the table"
 
 NO_PICTURE = "Take a picture of the cross beside a scale, square from above, and load it here."
 
+ADD = "Add these lengths to the table as a further reading"
+
 LEAST_ROWS = 4
 
 
@@ -189,8 +191,7 @@ class LaserPage(Page):
         self.scale.set_value(10.0)
         self.scale.edited.connect(lambda _: self._dragged())
         self.lengths = Message(2)
-        tip = "Add these lengths to the table as a further reading"
-        self.add_button = button("Add as a reading", tip, self.add_reading)
+        self.add_button = button("Add as a reading", ADD, self.add_reading)
         self.picture_part = FieldForm(load, self.answer, self.scale, self.lengths, self.add_button)
         return self.picture_part
 
@@ -322,7 +323,8 @@ class LaserPage(Page):
         return lengths
 
     def _dragged(self) -> None:
-        self.add_button.setEnabled(self._cross() is not None and not self.locked)
+        unmarked = "" if self._cross() is not None else "Place the points on the cross first"
+        allow(self.add_button, ADD, self.locked or unmarked)
 
 
 def _length_field(column: int) -> NumberField:

@@ -41,6 +41,8 @@ IN_USE = f"{DONE} This calibration is in use"
 
 ADD = "A further picture of the same board, tilted or nearer to a corner of the picture"
 
+FIND = "Look for the dot and the two bars in the picture"
+
 PRINTS = ("imaging_plane_4_inch", *BOARDS)
 """Targets that can be printed: that of the dissertation, and the boards."""
 
@@ -182,11 +184,7 @@ class PlanePage(Page):
         self.unit.set_value(presenter.UNIT_MM)
         self.unit.edited.connect(lambda _: self._unit_changed())
         self._make_board_fields()
-        self.find_button = button(
-            "Find O′ and the axes",
-            "Look for the dot and the two bars in the picture",
-            self.find_axes,
-        )
+        self.find_button = button("Find O′ and the axes", FIND, self.find_axes)
         fill(
             self.panel_layout,
             FieldForm(
@@ -359,8 +357,8 @@ class PlanePage(Page):
         elif is_board:
             self.model.set_value("homography")
         self.square.setEnabled(is_board and not self.locked)
-        self.add_button.setEnabled(is_board and not self.locked)
-        self.add_button.setToolTip(ADD if is_board else f"{ADD}: load the one in the plane first")
+        no_board = "" if is_board else f"{ADD}: load the one in the plane first"
+        allow(self.add_button, ADD, self.locked or no_board)
         self.applied.setText(IN_USE if presenter.is_in_use(self.session, self.found) else "")
         self._show_residuals()
         self.result.set_rows(result.rows)
@@ -372,7 +370,8 @@ class PlanePage(Page):
         unusable = result.why_not or self.locked
         tip = "Measure with this calibration; undo restores the former one"
         allow(self.use_button, tip, unusable)
-        self.find_button.setEnabled(self.view.picture is not None and not self.locked)
+        no_picture = "" if self.view.picture is not None else "Load a picture of the target first"
+        allow(self.find_button, FIND, self.locked or no_picture)
         for point in self.points:
             point.movable = not self.locked
         self._axes.setVisible(self.found is not None)

@@ -93,7 +93,7 @@ class TrendsPage(Page):
         self.spectrum.show_curves(shown.spectrum, shown.spectrum_axis)
         self.spectrum_words.setText(shown.spectrum_words)
         self.signals_words.setText(shown.signals_words)
-        self._show_signals(session.signals, session.read_only)
+        self._show_signals(session.signals)
         for key, box in self._boxes.items():
             if key not in SIGNALS:
                 box.setVisible(not session.has_lines)
@@ -125,13 +125,10 @@ class TrendsPage(Page):
         picture: QPixmap = self.plots.canvas.grab()
         return picture
 
-    def _show_signals(self, signals: Signals | None, read_only: bool) -> None:
-        self.read_button.setEnabled(not read_only)
+    def _show_signals(self, signals: Signals | None) -> None:
         self.forget_button.setVisible(signals is not None)
-        self.forget_button.setEnabled(not read_only)
         for widget in (self.start, self.start.label):
             widget.setVisible(signals is not None)
-            widget.setEnabled(not read_only)
         self.start.set_value(None if signals is None else signals.start_s)
         for key in SIGNALS:
             self._boxes[key].setVisible(signals is not None)
@@ -275,6 +272,7 @@ class TrendsPage(Page):
             lambda: self.workspace.attempt(lambda session: session.set_signals(None)),
         )
         keep_room(self.start, self.start.label, self.forget_button)
+        self.lock_with_session(self.start, self.read_button, self.forget_button)
         fill(
             self.panel_layout,
             *(heading("Current and voltage"), hbox(self.start.label, (self.start, 1))),

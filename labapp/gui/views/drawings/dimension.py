@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pyqtgraph as pg
 from PySide6.QtCore import QPoint, QPointF, QRect
+from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QAbstractSpinBox, QLayout, QWidget
 
 from labapp.core.values import FloatArray
@@ -25,6 +26,7 @@ class DimensionBox(QWidget):
         super().__init__(plot)
         self.plot = plot
         self.field = field
+        self._place = QPoint()
         self.setAutoFillBackground(True)
         editor = field.editor
         assert isinstance(editor, QAbstractSpinBox)
@@ -45,9 +47,7 @@ class DimensionBox(QWidget):
         scene = self.plot.getViewBox().mapViewToScene(QPointF(*place.tolist()))
         rect = QRect(QPoint(), self.sizeHint())
         rect.moveCenter(self.plot.mapFromScene(scene))
-        room = self.plot.rect().adjusted(2, 2, -2, -2)
-        rect.moveLeft(max(room.left(), min(rect.left(), room.right() - rect.width())))
-        rect.moveTop(max(room.top(), min(rect.top(), room.bottom() - rect.height())))
+        rect, room = self._moved_inside(rect), self._room
         places = (rect.translated(dx, dy) for dx, dy in STEPS)
         free = (
             place
@@ -55,5 +55,24 @@ class DimensionBox(QWidget):
             if room.contains(place) and not any(place.intersects(other) for other in others)
         )
         rect = next(free, rect)
-        self.move(rect.topLeft())
+        self._place = rect.topLeft()
+        self.move(self._place)
         others.append(rect)
+
+    @property
+    def _room(self) -> QRect:
+        room: QRect = self.plot.rect().adjusted(2, 2, -2, -2)
+        return room
+
+    def _moved_inside(self, rect: QRect) -> QRect:
+        """The rectangle, moved so that the plot contains it."""
+        room = self._room
+        left = max(room.left(), min(rect.left(), room.right() - rect.width()))
+        top = max(room.top(), min(rect.top(), room.bottom() - rect.height()))
+        return QRect(QPoint(left, top), rect.size())
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Show all of a problem's text: inside the plot, and in front of the other boxes."""
+        super().resizeEvent(event)
+        self.move(self._moved_inside(QRect(self._place, self.size())).topLeft())
+        self.raise_()
