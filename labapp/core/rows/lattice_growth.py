@@ -29,6 +29,9 @@ from labapp.core.values import (
 MOST_STEPS = 1000
 """Largest number of steps that a grid grows from its seed."""
 
+NEARLY_ALL = 0.95
+"""A grid with a larger share of all dots is not merged with others."""
+
 LEAST_SHARED = 4
 """Grids are merged if they have at least this many dots in common, not all on one line, and agree
 on their rows and columns."""
@@ -36,6 +39,10 @@ on their rows and columns."""
 MOST_SLIP, MOST_SLANT = 0.55, 0.7
 """A row is misaligned by a column if the slant of its columns differs from that of other rows by at
 least the first, or is at least the second, in steps along the row: both slightly over a half."""
+
+MOST_UNSTEADY = 0.5
+"""Largest difference of a step from the median of those around it, in rows or in columns. A step to
+the wrong dot differs by 0.6 … 1; on strongly curved surfaces, the difference reaches 0.35."""
 
 NEAREST, NEAR = 10, 40
 """Numbers of nearest dots among which a dot's opposite neighbours, and a dot off their line, are
@@ -107,11 +114,11 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         tried[dot] = True
         if len(dot) >= settings.least:
             grown = _upright(_reduced(_grid_of(k, t, dot), dots_px), dots_px)
-            grids.append(_without_slips(grown, dots_px))
+            grids.append(_sound_part(grown, dots_px))
     grid = max(grids, key=_count, default=np.empty((0, 0), np.int64))
-    if len(grids) > 1 and _count(grid) < settings.share * len(dots):
+    if len(grids) > 1 and _count(grid) < NEARLY_ALL * len(dots):
         whole = _upright(_reduced(merge_grids(grids), dots_px), dots_px)
-        grid = max(grid, _without_slips(whole, dots_px), key=_count)
+        grid = max(grid, _sound_part(whole, dots_px), key=_count)
     if _count(grid) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
     grid = _grid_of(*_sites(grid))  # without empty margins
@@ -298,6 +305,15 @@ def _upright(grid: IntArray, dots_px: ComplexArray) -> IntArray:
     if np.nansum(across.imag) < 0:
         grid = grid[::-1]
     return grid
+
+
+def _sound_part(grid: IntArray, dots_px: ComplexArray) -> IntArray:
+    """Keep the largest part of a grid without misalignment, in whole rows and in single steps."""
+    from labapp.core.rows.lattice_kernels import sound_part
+
+    grid = _without_slips(grid, dots_px)
+    kept = sound_part(np.sort(dots_px), _places(grid, dots_px), MOST_UNSTEADY)
+    return np.where(kept, grid, -1)
 
 
 def _without_slips(grid: IntArray, dots_px: ComplexArray) -> IntArray:
