@@ -99,6 +99,21 @@ def test_no_row_is_skipped_at_wide_gaps(seed: int, tilt: tuple[float, float]) ->
     assert_equivalent(lattice, true)
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("missing", "scatter_px"), [(0.25, 0.3), (0.0, 2.0), (0.15, 1.5)])
+def test_grid_with_many_holes_or_scattered_dots_is_indexed(
+    seed: int, missing: float, scatter_px: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    true = np.mgrid[0:15, 0:15].reshape(2, -1).T
+    true = true[rng.random(len(true)) >= missing]
+    across = np.array([[3.0, -19.5], [20.0, 2.0]])  # rows upwards, columns to the right
+    positions = 100 + true @ across + rng.normal(0, scatter_px, true.shape)
+    lattice = grow_lattice(as_dots(positions + np.array([0, 300])), GrowSettings())
+    assert (lattice.row > 0).mean() > 0.85
+    assert_equivalent(lattice, true)
+
+
 @pytest.mark.parametrize("skipped", [True, False])
 def test_row_that_skips_another_is_not_sound(skipped: bool) -> None:
     u, v = np.meshgrid(10.0 * np.arange(6), 10.0 * np.arange(8))

@@ -38,6 +38,10 @@ AROUND = 2
 AT_CORNER = 0.15
 """Dots within this share of a triangle's sides from a corner are at the corner."""
 
+FIT_REACH, LEAST_FITTED, MOST_ROUGH = 3, 8, 0.16
+"""A plane is fitted to the dots from sites within this many rows and columns of a site; least
+number of these dots; their largest standard deviation from the plane, in steps."""
+
 Claim = tuple[float, int, int, int]
 """Cost of a site's dot, from its distance to predictions; the site's row and column; the dot."""
 
@@ -260,19 +264,34 @@ def grow(
 
 
 @inner
-def _median_step(places: ComplexArray, k: int, t: int, dk: int, dt: int) -> complex:
+def _insert(values: FloatArray, count: int, value: float) -> None:
+    """Insert a value into the first so many values, which are sorted."""
+    while count > 0 and values[count - 1] > value:
+        values[count] = values[count - 1]
+        count -= 1
+    values[count] = value
+
+
+@inner
+def _median_step(
+    places: ComplexArray, k: int, t: int, dk: int, dt: int, scratch: FloatArray
+) -> complex:
     """Median step by (dk, dt) sites from the sites around one, each component; NaN if none."""
     rows, columns = places.shape
-    real, imag, count = np.empty((2 * AROUND + 1) ** 2), np.empty((2 * AROUND + 1) ** 2), 0
+    count = 0
     for i in range(max(k - AROUND, 0), min(k + AROUND + 1, rows - dk)):
         for j in range(max(t - AROUND, 0), min(t + AROUND + 1, columns - dt)):
             step = places[i + dk, j + dt] - places[i, j]
             if not np.isnan(step.real):
-                real[count], imag[count] = step.real, step.imag
+                _insert(scratch[0], count, step.real)
+                _insert(scratch[1], count, step.imag)
                 count += 1
     if count == 0:
         return complex(np.nan, np.nan)
-    return complex(np.median(real[:count]), np.median(imag[:count]))
+    low, high = (count - 1) // 2, count // 2
+    return complex(
+        (scratch[0, low] + scratch[0, high]) / 2, (scratch[1, low] + scratch[1, high]) / 2
+    )
 
 
 @inner
@@ -282,12 +301,13 @@ def _steady_steps(places: ComplexArray, most: float) -> BoolArray:
     Shape (2, rows, columns); false where there is no step.
     """
     rows, columns = places.shape
-    steady = np.zeros((2, rows, columns), np.bool_)
+    steady, scratch = np.zeros((2, rows, columns), np.bool_), np.empty((2, (2 * AROUND + 1) ** 2))
     for k in range(rows):
         for t in range(columns):
             if np.isnan(places[k, t].real):
                 continue
-            up, right = _median_step(places, k, t, 1, 0), _median_step(places, k, t, 0, 1)
+            up = _median_step(places, k, t, 1, 0, scratch)
+            right = _median_step(places, k, t, 0, 1, scratch)
             cell = most * abs((up.conjugate() * right).imag)
             for way in range(2):
                 next_k, next_t = k + 1 - way, t + way
@@ -363,3 +383,79 @@ def sound_part(dots_px: ComplexArray, places: ComplexArray, most: float) -> Bool
                 count[part[k, t]] += 1
     largest: BoolArray = part == count.argmax()
     return largest
+
+
+@inner
+def _fitted_place(dots_px: ComplexArray, grid: IntArray, k: int, t: int) -> tuple[complex, float]:
+    """Position of a site by a fit that is linear in rows and columns, and the shortest step.
+
+    The step is 0 where there are too few dots, or they are too irregular.
+    """
+    count, mean_k, mean_t, mean = 0.0, 0.0, 0.0, 0.0 + 0.0j
+    kk, kt, tt, square, by_k, by_t = 0.0, 0.0, 0.0, 0.0, 0.0 + 0.0j, 0.0 + 0.0j
+    last_k, last_t = min(k + FIT_REACH + 1, grid.shape[0]), min(t + FIT_REACH + 1, grid.shape[1])
+    for i in range(max(k - FIT_REACH, 0), last_k):
+        for j in range(max(t - FIT_REACH, 0), last_t):
+            if grid[i, j] < 0:
+                continue
+            # Sums of squares and products about the means, updated dot by dot.
+            count += 1.0
+            off_k, off_t, off = i - k - mean_k, j - t - mean_t, dots_px[grid[i, j]] - mean
+            mean_k, mean_t, mean = (
+                mean_k + off_k / count,
+                mean_t + off_t / count,
+                mean + off / count,
+            )
+            share = (count - 1.0) / count
+            kk, kt, tt = kk + share * off_k**2, kt + share * off_k * off_t, tt + share * off_t**2
+            by_k, by_t = by_k + share * off_k * off, by_t + share * off_t * off
+            square += share * (off.real**2 + off.imag**2)
+    area = kk * tt - kt * kt
+    if count < LEAST_FITTED or area < 0.1 * kk * tt:
+        return 0.0 + 0.0j, 0.0
+    up, right = (tt * by_k - kt * by_t) / area, (kk * by_t - kt * by_k) / area
+    rest = square - (up.conjugate() * by_k + right.conjugate() * by_t).real
+    step = min(abs(up), abs(right), abs(up + right), abs(up - right))
+    if rest > (count - 3.0) * (MOST_ROUGH * step) ** 2:
+        return 0.0 + 0.0j, 0.0
+    return mean - mean_k * up - mean_t * right, step
+
+
+@compiled(_dots, _sites, _f, _f)
+def extend(dots_px: ComplexArray, grid: IntArray, gate: float, doubt: float) -> None:
+    """Add dots to a nearly regular grid, from the places that its dots around a site suggest.
+
+    Parameters
+    ----------
+    dots_px
+        The dots, u − iv, shape (n,), px, sorted by u.
+    grid
+        The dot at each site, −1 if there is none, shape (rows, columns); changed in place.
+    gate, doubt
+        As in `lattice_growth.GrowSettings`.
+    """
+    rows, columns = grid.shape
+    site_of = np.full(len(dots_px), -1)
+    for k in range(rows):
+        for t in range(columns):
+            if grid[k, t] >= 0:
+                site_of[grid[k, t]] = k * columns + t
+    added = True
+    while added:
+        added = False
+        claims = [(0, 0)][:0]
+        claimed = np.zeros(len(dots_px), np.int64)
+        for k in range(1, rows - 1):
+            for t in range(1, columns - 1):
+                if grid[k, t] >= 0 or grid[k - 1 : k + 2, t - 1 : t + 2].max() < 0:
+                    continue
+                place, step = _fitted_place(dots_px, grid, k, t)
+                dot, distance, second = _nearest(dots_px, place, doubt * gate * step)
+                certain = distance < gate * step and second >= doubt * distance
+                if dot >= 0 and certain and site_of[dot] < 0:
+                    claims.append((k * columns + t, dot))
+                    claimed[dot] += 1
+        for site, dot in claims:
+            if claimed[dot] == 1:
+                grid[site // columns, site % columns], site_of[dot] = dot, site
+                added = True
