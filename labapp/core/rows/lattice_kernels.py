@@ -32,7 +32,7 @@ MOST_OPEN = 0.6
 """Largest closure error of a valid cell, in sides: the difference between the two paths around it.
 After a misalignment by one column it is about 1."""
 
-AROUND = 2
+AROUND = 3
 """Steps are compared with the median of those from sites within this many rows and columns."""
 
 AT_CORNER = 0.15
