@@ -51,6 +51,25 @@ def test_dots_of_any_size_are_found_and_measured(size: float) -> None:
     assert np.median(dots.peak) == pytest.approx(40.0, rel=0.15)
 
 
+@pytest.mark.parametrize("step", [7.0, 9.0])
+def test_dots_of_little_more_than_a_pixel_are_found(step: float) -> None:
+    places = grid(step)
+    noise = np.random.default_rng(1).normal(20.0, 3.0, SHAPE)
+    dots = band_pass_dots(draw(places, 0.7, 100.0) + noise, BandPassSettings())
+    assert len(dots) == len(places)
+    assert np.linalg.norm(offsets(dots.image_px, places), axis=1).max() < 0.5
+
+
+@pytest.mark.parametrize("noise", [1.0, 4.0, 10.0])
+def test_hot_pixels_alone_give_no_dot_size(noise: float) -> None:
+    rng = np.random.default_rng(2)
+    frame = rng.normal(40.0, noise, SHAPE)
+    frame.ravel()[rng.integers(0, frame.size, 400)] = rng.uniform(120.0, 255.0, 400)
+    picture = dot_size.as_picture(np.clip(frame, 0, 255).astype(np.uint8))
+    size = dot_size.estimate_size(picture, dot_size.local_noise(picture))
+    assert size == dot_size.USUAL_PX
+
+
 @pytest.mark.parametrize("snr", [6.0, 12.0, 25.0])
 @pytest.mark.slow
 def test_position_error_is_at_white_noise_limit_and_matches_sigma(snr: float) -> None:

@@ -50,6 +50,14 @@ If part of a picture is blank, noise in the rest makes a blob every few pixels."
 WHOLE = 0.6
 """Smaller blobs within a blob are its parts if it has at least this share of their response."""
 
+SHARP = 20.0
+"""Dots are of the smallest scale if its blobs have more than so many times the votes of all others
+and are no hot pixels (`_are_dots`)."""
+
+LEAST_SHARP, WIDER = 50, 0.7
+"""Least number of such blobs; least median ratio of their responses at the next scale and at the
+smallest. It is 0.5 for single pixels and 0.9 for Gaussian dots of the smallest scale."""
+
 BEST = 0.884
 """Scale of the band with the largest response to a Gaussian dot, over the dot's size: about
 1/√(NARROW · WIDE)."""
@@ -87,7 +95,8 @@ def estimate_size(picture: Picture, noise: Grey) -> float:
     A blob is a maximum over position and scale of the scale-normalised band-pass. It votes with
     its response times its size, since speckle grains would otherwise outvote the dots they are in.
     A blob within a larger one of about the same response is a lobe or a grain of it and does not
-    vote. Spikes peak at the smallest scale and gradients at the largest, which are not accepted.
+    vote. Spikes peak at the smallest scale and gradients at the largest, which are not accepted,
+    except that the smallest is if nearly all blobs peak there (`SHARP`).
 
     Half resolution is sufficient for most sizes; full resolution costs four times as much.
     """
@@ -116,6 +125,8 @@ def _size_from(picture: Picture, level: float, finest: int) -> float | None:
             )
     votes = np.array([SCALES_PX[some.scale] * some.own[some.votes].sum() for some in kinds])
     if finest == 0:
+        if votes[0] > SHARP * votes[1:].sum() and _are_dots(kinds[0]):
+            return float(SCALES_PX[0] / BEST)
         votes[:1] = 0.0
     if not votes.any():
         return None
@@ -126,6 +137,12 @@ def _size_from(picture: Picture, level: float, finest: int) -> float | None:
     scale = np.concatenate([some.scale + some.beyond()[some.votes] for some in near])
     weight = np.concatenate([some.own[some.votes] for some in near])
     return float(SCALES_PX[0] * 2 ** (np.average(scale, weights=weight) / 2) / BEST)
+
+
+def _are_dots(sharpest: _Blobs) -> bool:
+    """Whether blobs of the smallest scale are dots rather than hot pixels."""
+    wider = sharpest.more[sharpest.votes] / sharpest.own[sharpest.votes]
+    return len(wider) >= LEAST_SHARP and float(np.median(wider)) > WIDER
 
 
 @dataclass
