@@ -31,7 +31,7 @@ from labapp.cli.shared import (
     progress_bar,
     progress_sink,
     warned,
-    with_methods,
+    with_detector_and_rows,
 )
 from labapp.files import as_bytes, write_file
 
@@ -104,7 +104,7 @@ def reconstruct(
 
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
     check_algorithm(settings, "--algorithm")
-    settings = with_methods(settings, detector, rows)
+    settings = with_detector_and_rows(settings, detector, rows)
     places = {"lines": lines, "opcua": opcua}
     with ExitStack() as at_end:
         predictor = at_end.enter_context(_predicting(model, out)) if model is not None else None

@@ -63,7 +63,8 @@ class LiveWatch:
         self._streams: dict[str, Stream] = {}
         self._is_closed = False
         self._measured_s, self._last = time.monotonic(), (0, 0.0)
-        self._is_drawn = threading.Event()
+        """Time of the last result; number and time of its frame, s by the camera's clock."""
+        self._scene_is_due = threading.Event()
         self.predictor: Predictor | None = None
         """Predictor of penetration; may be replaced at any time."""
         self._sinks = (self._judge, self.trend.add, self._predict, self._show, self._publish)
@@ -98,9 +99,9 @@ class LiveWatch:
         LiveMeasuringEnded
             If the measuring process has ended.
         """
-        drawn, began_s = self._is_drawn.is_set(), time.monotonic()
+        with_scene, began_s = self._scene_is_due.is_set(), time.monotonic()
         try:
-            result = self._measuring.measure(frame, drawn)
+            result = self._measuring.measure(frame, with_scene)
         except Exception as error:
             if not self._is_closed:
                 self._raise_silence(f"Nothing is measured any more: {error}")
@@ -128,7 +129,7 @@ class LiveWatch:
     def _show(self, result: LiveResult) -> None:
         """Store the result and its surface for `newest` and `scene`."""
         if result.scene is not None:
-            self._is_drawn.clear()
+            self._scene_is_due.clear()
             self._scene.append(result.scene)
         self._newest.append(result)
 
@@ -160,7 +161,7 @@ class LiveWatch:
 
     def ask_for_scene(self) -> None:
         """Request the surface of the next measured frame for drawing."""
-        self._is_drawn.set()
+        self._scene_is_due.set()
 
     def scene(self) -> Scene | None:
         """Return the requested surface; None if it is not available yet or was returned before."""
