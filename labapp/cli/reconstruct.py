@@ -1,8 +1,10 @@
 """`labapp reconstruct`: measure a recording and write the results as tables and surfaces.
 
-Data flow: `media.open_source` reads a frame, a measurer (`run.measurers`) measures it
-(`core.pipeline.measure`), and `run.runner.run` passes its `FrameResult` to the sinks: the results
-folder (`export.results`), the summary, streams, progress.
+Data flow: `media.open_source` reads a frame. A measurer (`run.measurers`) measures it: cold by
+`core.pipeline.measure`, or tracked by `core.recording.chain`, which calls the same function with a
+prior. Neighbouring frames vote on its rows (`core.recording.row_vote`), and its residuals are added
+to the check of the set-up (`core.recording.residual_check`). `run.runner.run` passes its
+`FrameResult` to the sinks: the results folder (`export.results`), the summary, streams, progress.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Live measurement of a camera's frames: sizes, their trend, alarms, streams."""
+"""Live measurement of a camera's frames: sizes, their trend, alarms, streams.
+
+Data flow: the camera's thread puts a frame into the queue (`live_queue`), from which a thread of
+`gui.live.live` takes the next one. It is measured in a process (`live_measuring`) by tracking, and
+its `LiveResult` passed to the sinks. The window polls the newest result and surface.
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from labapp.core.surface.solver import NEWTON_STEPS, Rounds
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
-MEMORY, ORDER, TEACHERS = 32, 8, 3
+MEMORY, ORDER, STRIDE = 32, 8, 3
 """Number of past frames from which the recurrence is estimated, its maximum order, and the stride
 over lit rays: every third one is sufficient."""
 
@@ -215,8 +215,8 @@ def predictions(prior: Prior) -> Iterator[FloatArray]:
     """
     past, order = prior.past, min(ORDER, len(prior.past) // 2)
     if order > 2:
-        teachers = np.flatnonzero(prior.lit)[::TEACHERS]
-        ratio, mean = recurrence(prior.slopes, teachers, order), past.mean(axis=0)
+        rays = np.flatnonzero(prior.lit)[::STRIDE]
+        ratio, mean = recurrence(prior.slopes, rays, order), past.mean(axis=0)
         yield mean + ratio @ (past[: -order - 1 : -1] - mean)
     if len(past) > 1:
         yield 2 * past[-1] - past[-2]
