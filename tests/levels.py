@@ -13,7 +13,7 @@ def find_level(
     height: FloatArray,
     slope: FloatArray,
     y: FloatArray,
-    witness: IntArray,
+    ray_states: IntArray,
     spacing_mm: FloatArray,
     rear: tuple[int, float | None] = (1, None),
     about: tuple[float, int, float] = (0.0, 1, np.nan),
@@ -21,5 +21,5 @@ def find_level(
 ) -> Level:
     """Find the level (`level_kernels.find_level`); a drop of None is found along with it."""
     depth = np.array([np.nan if value is None else value for value in rear], float)
-    seen = height, slope, y, witness, spacing_mm
+    seen = height, slope, y, ray_states, spacing_mm
     return Level.of(level_kernels.find_level(*seen, depth, np.array(about, float), missing))

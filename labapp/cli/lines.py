@@ -105,11 +105,12 @@ def _measured(
     """Return the results of the finished frames, with progress on stderr."""
     from labapp.core.pipeline import Settings
     from labapp.export.frame_result import FrameResult
-    from labapp.run.measurers import ColdMeasurer, LineFollower
+    from labapp.run.line_measurer import LineMeasurer
+    from labapp.run.measurers import ColdMeasurer
     from labapp.run.runner import run
 
     given = (source.frame, bench, Settings())
-    measurer = LineFollower(*given, current) if follow else ColdMeasurer(*given)
+    measurer = LineMeasurer(*given, current) if follow else ColdMeasurer(*given)
     done = list[FrameResult]()
     with progress_bar() as progress:
         task = progress.add_task(source.name, total=len(frames))

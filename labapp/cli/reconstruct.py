@@ -1,8 +1,10 @@
 """`labapp reconstruct`: measure a recording and write the results as tables and surfaces.
 
-Data flow: `media.open_source` reads a frame, a measurer (`run.measurers`) measures it
-(`core.pipeline.measure`), and `run.runner.run` passes its `FrameResult` to the sinks: the results
-folder (`export.results`), the summary, streams, progress.
+Data flow: `media.open_source` reads a frame. A measurer (`run.measurers`) measures it: cold by
+`core.pipeline.measure`, or tracked by `core.recording.chain`, which calls the same function with a
+prior. Neighbouring frames vote on its rows (`core.recording.row_vote`), and its residuals are added
+to the check of the set-up (`core.recording.residual_check`). `run.runner.run` passes its
+`FrameResult` to the sinks: the results folder (`export.results`), the summary, streams, progress.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from labapp.cli.shared import (
     progress_bar,
     progress_sink,
     warned,
-    with_methods,
+    with_detector_and_rows,
 )
 from labapp.files import as_bytes, write_file
 
@@ -104,7 +106,7 @@ def reconstruct(
 
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
     check_algorithm(settings, "--algorithm")
-    settings = with_methods(settings, detector, rows)
+    settings = with_detector_and_rows(settings, detector, rows)
     places = {"lines": lines, "opcua": opcua}
     with ExitStack() as at_end:
         predictor = at_end.enter_context(_predicting(model, out)) if model is not None else None

@@ -197,7 +197,7 @@ def loaded_commands(module: str) -> type[Commands]:
     return LoadedCommands
 
 
-def with_methods(
+def with_detector_and_rows(
     settings: Settings, detector: DetectorName | None, rows: RowsName | None
 ) -> Settings:
     """Return settings with another detector and row search; None: unchanged."""

@@ -10,17 +10,19 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from labapp.config.mirror_text import mirror_text
 from labapp.config.toml_keys import Rule, are_numbers, is_matrix, is_number
-from labapp.core.bench_check.check import BenchCheck
 from labapp.core.geometry.rig import DotPattern, ImagingPlane, Rig
 from labapp.core.geometry.uncertainty import ENDINGS, FIRST, INDEX, QUANTITIES
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
+
+if TYPE_CHECKING:  # the check itself is loaded where a bench is checked
+    from labapp.core.bench_check.check import BenchCheck
 
 SECTION = "bench_check"
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tomlkit
@@ -31,7 +31,6 @@ from labapp.config.toml_keys import (
     shown,
     unknown_key,
 )
-from labapp.core.bench_check.check import BenchCheck
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.line_pattern import KIND as LINES
@@ -47,6 +46,9 @@ from labapp.core.geometry.uncertainty import (
 )
 from labapp.errors import InputError, os_errors_as_input
 from labapp.files import write_atomically
+
+if TYPE_CHECKING:  # see `labapp.config.bench_check`
+    from labapp.core.bench_check.check import BenchCheck
 
 A_SETUP = "a setup file (TOML, UTF-8)"
 

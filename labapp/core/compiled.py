@@ -9,9 +9,10 @@ from __future__ import annotations
 import logging
 import re
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -21,7 +22,6 @@ from typing import Any, TypeVar
 import llvmlite.binding
 import numba
 import platformdirs
-from filelock import FileLock
 from numba import types
 from numba.core.caching import _CacheLocator
 from numba.core.codegen import JITCodeLibrary
@@ -91,7 +91,7 @@ class BySource(_CacheLocator):
     """
 
     def __init__(self, function: Any, file: str) -> None:
-        self._source = _digest(function.__module__, Path(file))
+        self._folder = _folder_of(function.__module__, Path(file))
         self._line: int = function.__code__.co_firstlineno
 
     @classmethod
@@ -99,7 +99,7 @@ class BySource(_CacheLocator):
         """Return the cache entry of a function; None if it is not writable."""
         try:
             place = cls(function, file)
-            is_new = not Path(place.get_cache_path()).exists()
+            is_new = not place._folder.exists()
             place.ensure_cache_path()  # type: ignore[no-untyped-call]
         except OSError:
             return None
@@ -110,11 +110,16 @@ class BySource(_CacheLocator):
 
     def get_cache_path(self) -> str:
         """Return the cache folder of the function's file."""
-        return str(_folder() / self._source)
+        return str(self._folder)
+
+    def mark_of(self, function: Any) -> Path:
+        """Return the file that marks a function as compiled by this version of Python."""
+        name = f"{function.__name__}-{self._line}.{sys.implementation.cache_tag}.compiled"
+        return self._folder / name
 
     def get_source_stamp(self) -> str:
         """Return the digest of the sources."""
-        return self._source
+        return self._folder.name
 
     def get_disambiguator(self) -> str:
         """Return the line number, which distinguishes functions of the same name."""
@@ -194,6 +199,12 @@ def _folder() -> Path:
 
 
 @cache
+def _folder_of(module: str, file: Path) -> Path:
+    """Return the cache folder of a module that is being loaded, for each of its functions."""
+    return _folder() / _digest(module, file)
+
+
+@cache
 def _announce() -> None:
     # Once per process, however many files it compiles.
     logging.getLogger(NOTICES).warning(
@@ -209,10 +220,22 @@ def _delete_old(folder: Path) -> None:
                 shutil.rmtree(each, ignore_errors=True)
 
 
-def _one_at_a_time(function: Any) -> AbstractContextManager[object]:
-    """Lock the cache entry: one process compiles a function, the others then load it."""
+@contextmanager
+def _one_at_a_time(function: Any) -> Iterator[None]:
+    """Lock the cache entry: one process compiles a function, the others then load it.
+
+    Processes that start together would wait for each other's locks. So none is needed once the
+    function has a mark that it was compiled.
+    """
     place = BySource.from_function(function, function.__code__.co_filename)
-    return nullcontext() if place is None else FileLock(Path(place.get_cache_path()) / "lock")
+    if place is None or place.mark_of(function).exists():
+        yield
+        return
+    from filelock import FileLock
+
+    with FileLock(Path(place.get_cache_path()) / "lock"):
+        yield
+        place.mark_of(function).touch()
 
 
 def _compile_cached(function: F, *signature: Any) -> F:

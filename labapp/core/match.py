@@ -10,13 +10,13 @@ import numpy as np
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 Orientation = Literal["S/S", "S/I", "I/I"]
-"""Column/row correspondence: S for the same order as the rays, I for the inverse order."""
+"""Order of columns/order of rows: S as the rays, I inverse. Settings call it correspondence."""
 
 ORIENTATIONS: tuple[Orientation, ...] = ("S/S", "S/I", "I/I")
 
 
-def ways(orientation: Orientation) -> IntArray:
-    """Directions of reflected rows and columns relative to the rays': +1 or −1, shape (2,)."""
+def signs_of(orientation: Orientation) -> IntArray:
+    """Signs of reflected rows and columns relative to those of the rays, ±1, shape (2,)."""
     by_column, by_row = orientation.split("/")
     return np.array([1 if by_row == "S" else -1, 1 if by_column == "S" else -1])
 
@@ -36,10 +36,10 @@ class Trial:
     Parameters
     ----------
     orientation
-        The correspondence.
+        The orientation.
     residual_mm
         Root mean square distance between computed and captured dots, mm; infinite if no surface
-        has this correspondence.
+        has this orientation.
     """
 
     orientation: Orientation
@@ -53,7 +53,7 @@ class Match(ReadOnlyArrays):
     Parameters
     ----------
     orientation
-        The selected correspondence.
+        The selected orientation.
     dot
         Index of each pair's dot in `Dots`, shape (n,).
     ray
@@ -64,9 +64,9 @@ class Match(ReadOnlyArrays):
         Position of each dot on the imaging plane, IPCS (X′, Z′), shape (n, 2), mm.
     plane_covariance_mm2
         Covariance of the positions, shape (n, 2, 2), mm².
-    witness
-        Shape (rows, columns) of the pattern: +1 where the ray was reflected by the pool, −1 where
-        it was not, 0 if unknown (absent, blocked by the torch, off the plane, in doubt).
+    ray_states
+        State of every ray, shape (rows, columns): +1 lit, the pool reflected it; −1 dark, it did
+        not; 0 unknown (absent, blocked by the torch, off the plane, in doubt).
     trials
         All orientations tried, the best first.
     missing
@@ -79,7 +79,7 @@ class Match(ReadOnlyArrays):
     reflected: IntArray
     plane_mm: FloatArray
     plane_covariance_mm2: FloatArray
-    witness: IntArray
+    ray_states: IntArray
     trials: tuple[Trial, ...] = ()
     missing: float = 0.0
 
@@ -98,7 +98,7 @@ class MatchedDots:
     ray: IntArray
     plane_mm: FloatArray
     plane_covariance_mm2: FloatArray
-    witness: IntArray
+    ray_states: IntArray
     missing: float = 0.0
 
 

@@ -50,7 +50,7 @@ if TYPE_CHECKING:  # the module compiles: it is loaded where a frame is measured
 OnStep = Callable[[str], None]
 """Called with the name of a completed step, see `measure`."""
 
-ByHand = Correction | LineCorrection
+FrameCorrection = Correction | LineCorrection
 """The operator's correction of a frame: dots and rows, or the lines of a line pattern."""
 
 
@@ -117,7 +117,7 @@ class Measurement:
     match: Match | None = None
     reconstruction: Reconstruction | None = None
     measures: measures.Measures | None = None
-    correction: ByHand | None = None
+    correction: FrameCorrection | None = None
     setup_status: str = ""
     lines: LineFrame | None = None
 
@@ -179,7 +179,7 @@ def measure(
     bench: Bench,
     settings: Settings,
     prior: Prior | None = None,
-    correction: ByHand | None = None,
+    correction: FrameCorrection | None = None,
     on_step: OnStep = lambda _: None,
     dots: Dots | None = None,
 ) -> tuple[Measurement, Prior | None]:
@@ -230,12 +230,12 @@ def measure(
             from labapp.core.sequence.tracking import track
 
             if dots is None:
-                dots = quick_dots(_as_before(image, prior), prior.tuning, settings.dots.band_pass)
+                dots = _dots_by_tuning(image, prior.tuning, settings.dots)
             result = replace(result, dots=dots)
             on_step("dots")
             observed = Observation.of(dots, bench, frame_shape)
             tracked = track(prior, observed, settings.fit, match_settings)
-            match, previous = tracked.match, prior.known()
+            match, previous = tracked.match, prior.carried_over()
             lattice = lattice_of_match(match, rig, len(dots))
         else:
             dots, tuning = _dots_and_tuning(image, settings.dots)
@@ -279,20 +279,20 @@ def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -
     return replace(result, status=found.status, reason=found.reason, lines=found)
 
 
-def _as_before(image: Image, prior: Prior) -> Image:
-    """Check that the image has the size of the previous frame."""
-    if image.shape != prior.tuning.noise.shape:
-        from labapp.core.sequence.tracking import TrackLost
-
-        raise TrackLost("the frame differs in size from the previous frame")
-    return image
-
-
 def _dots_and_tuning(image: Image, settings: DotSettings) -> tuple[Dots, DetectorTuning | None]:
     """Find the dots, and the default detector's tuning for the following frames."""
     if settings.method == "band-pass":
         return tuned_dots(image, settings.band_pass)
     return find_dots(image, settings), None
+
+
+def _dots_by_tuning(image: Image, tuning: DetectorTuning, settings: DotSettings) -> Dots:
+    """Find the dots with the tuning of a previous frame, which must have the same size."""
+    if image.shape != tuning.noise.shape:
+        from labapp.core.sequence.tracking import TrackLost
+
+        raise TrackLost("the frame differs in size from the previous frame")
+    return quick_dots(image, tuning, settings.band_pass)
 
 
 def start_correction(measurement: Measurement) -> Correction:

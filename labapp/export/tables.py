@@ -99,7 +99,11 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("time_s", "time since the recording's first frame"),
         Column("status", "ok, or one word for why there is no surface", None),
         Column("scheme", "reconstruction scheme", None),
-        Column("correspondence", "orientation of columns and rows", None),
+        Column(
+            "correspondence",
+            "orientation: order of columns/rows, S as the rays, I inverse",
+            None,
+        ),
         Column("dots", "dots found", 0),
         Column("rows", "reflected rows found", 0),
         Column("are_mm", "average reflection error"),

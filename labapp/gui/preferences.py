@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import platformdirs
-from filelock import FileLock, Timeout
 from PySide6.QtCore import QObject, Signal
 
 from labapp.files import as_bytes, write_atomically
@@ -84,6 +83,8 @@ class PreferencesStore(QObject):
 
     def remember(self, change: Callable[[Preferences], Preferences]) -> None:
         """Change the stored preferences and write them, one window at a time."""
+        from filelock import FileLock, Timeout
+
         lock = FileLock(self.path.with_name(f".{self.path.name}.lock"), timeout=LOCK_S)
         with ExitStack() as held:
             with suppress(OSError, Timeout):  # better written without the lock than not at all

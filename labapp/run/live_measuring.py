@@ -19,7 +19,7 @@ from labapp.simulation.parallel import end_processes, held, hold, worker_pool
 JUDGED_S = 0.2
 """Time for which the quality of a frame is reused for the following ones, s."""
 
-SOUGHT_S = 1.0
+SEARCH_AFTER_S = 1.0
 """Time after a measured frame for which frames that cannot be tracked are skipped, s: the pool may
 return to its previous shape, and measuring a frame without tracking takes seconds."""
 
@@ -49,12 +49,12 @@ class LiveMeasuring:
         nice = 0  # normal priority: results are urgent
         self._pool = worker_pool(1, nice, hold, LiveChain, setup, settings, bit_depth)
 
-    def measure(self, frame: CameraFrame, drawn: bool = False) -> LiveResult | None:
-        """Measure the next frame; None if it is skipped (`SOUGHT_S`).
+    def measure(self, frame: CameraFrame, with_scene: bool = False) -> LiveResult | None:
+        """Measure the next frame; None if it is skipped (`SEARCH_AFTER_S`).
 
         Parameters
         ----------
-        drawn
+        with_scene
             Whether to return its surface for drawing, which takes another millisecond.
 
         Raises
@@ -63,7 +63,7 @@ class LiveMeasuring:
             If the process has ended.
         """
         try:
-            return self._pool.submit(_measured, frame, drawn).result()
+            return self._pool.submit(_measured, frame, with_scene).result()
         except (BrokenProcessPool, CancelledError, RuntimeError) as error:
             raise LiveMeasuringEnded(str(error)) from error
 
@@ -86,11 +86,11 @@ class LiveChain:
         self._measured_s = -math.inf
         self._judged: tuple[float, Quality] | None = None
 
-    def measure(self, frame: CameraFrame, drawn: bool) -> LiveResult | None:
+    def measure(self, frame: CameraFrame, with_scene: bool) -> LiveResult | None:
         """Measure the next frame, or skip it: see `LiveMeasuring.measure`."""
         found = self._chain.track(frame.image)
         if found is None:
-            if time.monotonic() < self._measured_s + SOUGHT_S:
+            if time.monotonic() < self._measured_s + SEARCH_AFTER_S:
                 self._chain.skip()
                 return None
             found = self._chain.search(frame.image)
@@ -105,7 +105,7 @@ class LiveChain:
             setup_doubt=self._record.doubt,
             track_lost=self._chain.track_lost,
             quality=self._quality(frame, found),
-            scene=scene_of(surface) if drawn and surface is not None else None,
+            scene=scene_of(surface) if with_scene and surface is not None else None,
         )
 
     def _quality(self, frame: CameraFrame, found: Measurement) -> Quality:
@@ -118,7 +118,7 @@ class LiveChain:
         return quality
 
 
-def _measured(frame: CameraFrame, drawn: bool) -> LiveResult | None:
+def _measured(frame: CameraFrame, with_scene: bool) -> LiveResult | None:
     """Measure a frame by the chain that this process holds."""
-    found: LiveResult | None = held().measure(frame, drawn)
+    found: LiveResult | None = held().measure(frame, with_scene)
     return found

@@ -49,7 +49,7 @@ class FrameQueue:
         """Running means of the frame interval and of the measuring time."""
         self._given: CameraFrame | None = None
         """Frame being measured."""
-        self._in_order = self._followed = 0
+        self._in_order = self._tracked = 0
         """Number of queued frames to be measured in order, and of frames tracked in a row."""
         self._is_behind = self._was_in_order = False
         """Whether the queue overflowed, and whether the frame being measured is one in order."""
@@ -105,12 +105,12 @@ class FrameQueue:
                 self._skipped += max(frame.number - given.number - self._every, 0)
             return frame
 
-    def done(self, followed: bool, took_s: float) -> None:
+    def done(self, tracked: bool, took_s: float) -> None:
         """Report whether the frame was tracked, and how long it took, s."""
         with self._turn:
             self._catching_up_s = self._catching_up_s + took_s if self._was_in_order else 0.0
-            if not followed:
-                self._followed = 0
+            if not tracked:
+                self._tracked = 0
                 if self._was_in_order or self._is_far():
                     # The queued frames cannot be tracked from this one, or are older still.
                     self._waiting.clear()
@@ -119,10 +119,10 @@ class FrameQueue:
                 return
             if self._catching_up_s > CATCH_UP_S:
                 self._in_order = 0
-            self._followed += 1
+            self._tracked += 1
             self._took_s = _mean(self._took_s, min(took_s, FAR_S))
             least_s = self._took_s / SHARE
-            if self._followed < 2 * MOST:
+            if self._tracked < 2 * MOST:
                 least_s = max(least_s, SWING_S)
             wanted = self._steps(least_s)
             grown_s = EASE * self._interval_s * (self._every - 1)

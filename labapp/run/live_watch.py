@@ -1,4 +1,9 @@
-"""Live measurement of a camera's frames: sizes, their trend, alarms, streams."""
+"""Live measurement of a camera's frames: sizes, their trend, alarms, streams.
+
+Data flow: the camera's thread puts a frame into the queue (`live_queue`), from which a thread of
+`gui.live.live` takes the next one. It is measured in a process (`live_measuring`) by tracking, and
+its `LiveResult` passed to the sinks. The window polls the newest result and surface.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +69,8 @@ class LiveWatch:
         self._streams: dict[str, Stream] = {}
         self._is_closed = False
         self._measured_s, self._last = time.monotonic(), (0, 0.0)
-        self._is_drawn = threading.Event()
+        """Time of the last result; number and time of its frame, s by the camera's clock."""
+        self._scene_is_due = threading.Event()
         self.predictor: Predictor | None = None
         """Predictor of penetration; may be replaced at any time."""
         self._sinks = (self._judge, self.trend.add, self._predict, self._show, self._publish)
@@ -102,11 +108,12 @@ class LiveWatch:
         LiveMeasuringEnded
             If the measuring process has ended.
         """
-        drawn, began_s, measuring = self._is_drawn.is_set(), time.monotonic(), self._measuring
+        with_scene, began_s = self._scene_is_due.is_set(), time.monotonic()
+        measuring = self._measuring
         if measuring is None:
             return
         try:
-            result = measuring.measure(frame, drawn)
+            result = measuring.measure(frame, with_scene)
         except Exception as error:
             if measuring is not self._measuring:
                 return  # the set-up was changed, or this was closed
@@ -136,7 +143,7 @@ class LiveWatch:
     def _show(self, result: LiveResult) -> None:
         """Store the result and its surface for `newest` and `scene`."""
         if result.scene is not None:
-            self._is_drawn.clear()
+            self._scene_is_due.clear()
             self._scene.append(result.scene)
         self._newest.append(result)
 
@@ -168,7 +175,7 @@ class LiveWatch:
 
     def ask_for_scene(self) -> None:
         """Request the surface of the next measured frame for drawing."""
-        self._is_drawn.set()
+        self._scene_is_due.set()
 
     def scene(self) -> Scene | None:
         """Return the requested surface; None if it is not available yet or was returned before."""

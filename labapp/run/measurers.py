@@ -5,7 +5,7 @@
 stretches of a recording in several processes, which also compute the rows of the tables.
 
 Stretches have the same length, however many processes there are, and each begins with three
-frames measured without tracking (`BY_THEMSELVES`), so that results do not depend on the machine.
+frames measured without tracking (`COLD_AT_START`), so that results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -22,18 +22,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
-import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from labapp.config.setup import Setup
-from labapp.core.pipeline import ByHand, Measurement, Settings, measure, setup_status
+from labapp.core.pipeline import FrameCorrection, Measurement, Settings, measure
 from labapp.core.recording.residual_check import Residuals
-from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.tables import table_rows
 from labapp.media import Frame, GreyImage, open_source
-from labapp.simulation.parallel import NICE, ONE_THREAD, Here, held, hold, in_order, worker_pool
+from labapp.simulation.parallel import (
+    NICE,
+    ONE_THREAD,
+    InlineExecutor,
+    held,
+    hold,
+    in_order,
+    worker_pool,
+)
 
 if TYPE_CHECKING:
     from labapp.core.recording.chain import WarmChain
@@ -50,14 +56,11 @@ MOST_WAITING = 5
 MOST_WAITING_FOR_OPEN = 20
 """The most frames that wait for votes on a frame whose rows are ambiguous."""
 
-FOLLOWED_AT_ONCE = 400
-"""The most frames whose pulses are classified together: some tens of periods."""
-
 STRETCH = 500
 """Frames of a stretch. A frame measured without tracking takes as long as ten to twenty tracked
 ones."""
 
-BY_THEMSELVES = frozenset({0, 1, 2})
+COLD_AT_START = frozenset({0, 1, 2})
 """Frames of a stretch that are measured without tracking, to vote independently on its rows."""
 
 BATCH, READ_AT_ONCE = 20, 8
@@ -66,7 +69,7 @@ BATCH, READ_AT_ONCE = 20, 8
 Read = Callable[[int], Frame]
 """Reads a frame by its number; raises `InputError` if it cannot."""
 
-Corrected = Callable[[int], ByHand | None]
+Corrected = Callable[[int], FrameCorrection | None]
 """Returns a frame's manually corrected dots and rows, or lines; None if there are none."""
 
 
@@ -93,10 +96,10 @@ class ColdMeasurer:
 
     def _submit(self, number: int) -> Future[FrameResult]:
         """Read a frame in this process, and measure it in the pool, or at once if there is none."""
-        frame = _read(self.read, number, self.setup, self.settings)
+        frame = read_frame(self.read, number, self.setup, self.settings)
         if isinstance(frame, FrameResult):
-            return Here().submit(lambda: frame)
-        pool = self.pool or Here()
+            return InlineExecutor().submit(lambda: frame)
+        pool = self.pool or InlineExecutor()
         return pool.submit(_cold, number, frame, self.setup, self.settings, self.corrected(number))
 
 
@@ -147,7 +150,7 @@ def _with_rows_voted(
             yield judged()
 
 
-def _read(read: Read, number: int, setup: Setup, settings: Settings) -> Frame | FrameResult:
+def read_frame(read: Read, number: int, setup: Setup, settings: Settings) -> Frame | FrameResult:
     """Return the frame, or its result if it cannot be read.
 
     Raises
@@ -164,7 +167,7 @@ def _read(read: Read, number: int, setup: Setup, settings: Settings) -> Frame | 
 
 
 def _cold(
-    number: int, frame: Frame, setup: Setup, settings: Settings, correction: ByHand | None
+    number: int, frame: Frame, setup: Setup, settings: Settings, correction: FrameCorrection | None
 ) -> FrameResult:
     """Measure a frame independently, with its manual correction, if any."""
     with _one_thread():
@@ -194,68 +197,6 @@ def _threads() -> ThreadpoolController:
 def measuring_pool(workers: int) -> ProcessPoolExecutor:
     """Return a pool of measuring processes, which have low priority."""
     return worker_pool(workers, NICE)
-
-
-# --- one line, over all frames ------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class LineFollower:
-    """Follows the line of a one-line pattern (§3.3), with frames classified by current pulse."""
-
-    read: Read
-    setup: Setup
-    settings: Settings
-    """As for `ColdMeasurer`."""
-    current: tuple[FloatArray, FloatArray] | None = None
-    """Times in the recording (s) and weld current (A), each shape (n,); None: not recorded."""
-
-    def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
-        """Measure frames; see `runner.Measurer`. Results come many at a time."""
-        from labapp.core.lines.frame import LineFrame
-        from labapp.core.lines.track import LineTracker, track_line
-
-        tracker = LineTracker()
-        for chosen in _classified_together(frames):
-            begun = [
-                (number, _read(self.read, number, self.setup, self.settings)) for number in chosen
-            ]
-            seen = [frame for _, frame in begun if isinstance(frame, Frame)]
-            time_s = np.array([np.nan if one.time_s is None else one.time_s for one in seen])
-            step = float(np.median(np.diff(time_s))) if len(seen) > 1 else 0.0
-            rate = 1 / step if step > 0 else None
-            images = (one.image for one in seen)
-            pulses, tracked = track_line(images, rate, tracker, self._at(time_s))
-            followed = zip(tracked, pulses.on.tolist(), pulses.probability.tolist(), strict=True)
-            for number, frame in begun:
-                if isinstance(frame, FrameResult):
-                    yield frame
-                    continue
-                lines = LineFrame.of_track(*next(followed))
-                found = Measurement(lines.status, lines.reason, self.settings.scheme, lines=lines)
-                status = setup_status(self.setup.rig)
-                yield FrameResult(number, frame.time_s, replace(found, setup_status=status))
-
-    def _at(self, time_s: FloatArray) -> FloatArray | None:
-        """Weld current at times, A, NaN beyond the recorded ones; None if there is none."""
-        if self.current is None:
-            return None
-        return np.asarray(np.interp(time_s, *self.current, left=np.nan, right=np.nan))
-
-
-def _classified_together(frames: Iterable[int]) -> Iterator[list[int]]:
-    """Divide frames into parts of `FOLLOWED_AT_ONCE`; the last two share the remainder equally.
-
-    A few remaining frames alone would not form two classes.
-    """
-    numbers = iter(frames)
-    part = list(islice(numbers, FOLLOWED_AT_ONCE))
-    while len(rest := list(islice(numbers, FOLLOWED_AT_ONCE))) == FOLLOWED_AT_ONCE:
-        yield part
-        part = rest
-    both = part + rest
-    half = -(-len(both) // 2) if rest else len(both)
-    yield from filter(None, (both[:half], both[half:]))
 
 
 # --- tracking from frame to frame ---------------------------------------------------------------
@@ -291,7 +232,7 @@ class WarmMeasurer:
         for read in self._read_ahead(frames):
             warm.look_ahead(frame.image for _, frame in read if isinstance(frame, Frame))
             for number, frame in read:
-                if place in BY_THEMSELVES:
+                if place in COLD_AT_START:
                     warm = self._chain()
                 before = None if last is None else number - last
                 if step is not None and before != step:
@@ -309,13 +250,13 @@ class WarmMeasurer:
                     yield FrameResult(number, frame.time_s, found, warm.track_lost)
 
     def _read_ahead(self, frames: Iterable[int]) -> Iterator[list[tuple[int, Frame | FrameResult]]]:
-        """Yield numbers and frames (`_read`), some at once, see `_next_batch`."""
+        """Yield numbers and frames (`read_frame`), some at once, see `_next_batch`."""
         numbers = iter(frames)
         while chosen := list(islice(numbers, READ_AT_ONCE)):
             read: list[tuple[int, Frame | FrameResult]] = []
             try:
                 for number in chosen:
-                    read.append((number, _read(self.read, number, self.setup, self.settings)))
+                    read.append((number, read_frame(self.read, number, self.setup, self.settings)))
             except InputError:  # after the frames before it
                 yield read
                 raise

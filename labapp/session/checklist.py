@@ -44,11 +44,12 @@ STEPS: Items = (
     (
         "3 Laser along the weld",
         "At about 30°, about 35 mm from the electrode's tip (90 mm for five lines). The pattern "
-        "covers the pool's place; lines lie across the weld. Then step 2 measures where it stands.",
+        "covers the pool's place; lines lie across the weld. Step Laser measures where it stands.",
     ),
     (
         "4 Imaging plane behind the torch",
-        "Across the weld, upright, about 50 mm from the electrode's axis. Step 3 calibrates it.",
+        "Across the weld, upright, about 50 mm from the electrode's axis. Step Imaging plane "
+        "calibrates it.",
     ),
     (
         "5 Camera before the plane",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from labapp.config.setup import Setup
     from labapp.core.lines.correction import LineCorrection
-    from labapp.core.pipeline import ByHand, Settings
+    from labapp.core.pipeline import FrameCorrection, Settings
     from labapp.core.recording.residual_check import SetupVerdict
     from labapp.core.rows.correction import Correction
     from labapp.core.values import IntArray
@@ -185,8 +185,8 @@ class SessionContents:
         found = self._by_hand(frame)
         return found if isinstance(found, LineCorrection) else None
 
-    def _by_hand(self, frame: int) -> ByHand | None:
-        found: ByHand | None = self._documents.get("correction", frame)
+    def _by_hand(self, frame: int) -> FrameCorrection | None:
+        found: FrameCorrection | None = self._documents.get("correction", frame)
         return found
 
     @property

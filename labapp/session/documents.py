@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, Never
 
-from labapp.core.pipeline import ByHand, Settings
+from labapp.core.pipeline import FrameCorrection, Settings
 from labapp.errors import InputError
 from labapp.run.limits import Limits
 from labapp.session.file.blobs import Damaged, fingerprint_of, pack, unpack, unpack_from
@@ -45,7 +45,7 @@ CLASSES: dict[str, Any] = {
     "laser-calibration": LaserReadings,
     "plane-calibration": PlanePicture,
     "bench-check": BenchCheckRecord,
-    "correction": ByHand,
+    "correction": FrameCorrection,
     "signals": Signals,
     "limits": Limits,
 }

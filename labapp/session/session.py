@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         LaserCalibrationSettings,
     )
     from labapp.core.calibration.plane_calibration import PlaneCalibration
-    from labapp.core.pipeline import ByHand, Measurement, Settings
+    from labapp.core.pipeline import FrameCorrection, Measurement, Settings
     from labapp.export.folder import ExportChoice, ExportedFile
     from labapp.export.frame_result import FrameResult
     from labapp.media import GreyImage
@@ -384,7 +384,9 @@ class Session(SessionContents):
             check_algorithm(settings, "set_settings", "settings.algorithm")
         self._documents.change(label, {("settings", NO_FRAME): settings})
 
-    def correct(self, corrections: Mapping[int, ByHand | None], label: str = "correction") -> None:
+    def correct(
+        self, corrections: Mapping[int, FrameCorrection | None], label: str = "correction"
+    ) -> None:
         """Set the corrections of frames in one change; None deletes the correction of a frame.
 
         Parameters
@@ -569,7 +571,8 @@ class Session(SessionContents):
             If the set-up is incomplete, or a result cannot be saved; at the end, if frames have
             changed since the import.
         """
-        from labapp.run.measurers import ColdMeasurer, LineFollower, WarmMeasurer
+        from labapp.run.line_measurer import LineMeasurer
+        from labapp.run.measurers import ColdMeasurer, WarmMeasurer
         from labapp.run.runner import run
         from labapp.session.file.blobs import fingerprint
         from labapp.session.results.measured import Basis
@@ -597,7 +600,7 @@ class Session(SessionContents):
         lines = rig is not None  # no tracking, and no check of the set-up
         measurer: Measurer = (WarmMeasurer if warm and not lines else ColdMeasurer)(*given, pool)
         if rig is not None and rig.pattern.count == 1:
-            measurer = LineFollower(*given[:3])
+            measurer = LineMeasurer(*given[:3])
         numbers = (int(number) for number in chosen)
         try:
             for result in run(numbers, measurer, [store, *sinks]):

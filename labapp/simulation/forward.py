@@ -168,8 +168,8 @@ def exact_match(
         plane = plane + rng.normal(0.0, sigma_mm, plane.shape)
     if orientation is None:
         orientation = seen_orientation(reflections)
-    witness = np.where(visible, 1, np.where(~reflections.hit, -1, 0))
-    witness[reflections.absent] = 0
+    ray_states = np.where(visible, 1, np.where(~reflections.hit, -1, 0))
+    ray_states[reflections.absent] = 0
     return Match(
         orientation=orientation,
         dot=np.arange(len(ray)),
@@ -177,7 +177,7 @@ def exact_match(
         reflected=_reflected_numbers(ray, orientation),
         plane_mm=plane,
         plane_covariance_mm2=np.tile(max(sigma_mm, 1e-3) ** 2 * np.eye(2), (len(ray), 1, 1)),
-        witness=witness,
+        ray_states=ray_states,
     )
 
 

@@ -126,8 +126,8 @@ def in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
             future.cancel()
 
 
-class Here(Executor):
-    """Runs each task immediately, in this process."""
+class InlineExecutor(Executor):
+    """Runs each task at once, in the calling thread."""
 
     def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
         """Call a function at once; the future has its result or its exception."""

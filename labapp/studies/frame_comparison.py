@@ -14,7 +14,7 @@ from typing import get_args
 import numpy as np
 
 from labapp.core.geometry.rig import Rig
-from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
+from labapp.core.match import ORIENTATIONS, Match, Orientation, signs_of
 from labapp.core.matching.row_shape import ALLOWED, match_row_shapes
 from labapp.core.schemes.irs import Algorithm, IrsSettings, estimates
 from labapp.core.schemes.slopes import Estimate, ReflectedRays, reflected_rays
@@ -28,10 +28,10 @@ COLUMNS = ("are_mm", "mre_mm", "are_inner_mm", "mre_inner_mm")
 def with_orientation(match: Match, rig: Rig, orientation: Orientation) -> Match:
     """The same dots with the rays of another correspondence, mirrored about the marker's ray.
 
-    No ray is a witness then, because it is unknown which of the other rays were reflected.
+    No ray is known to be lit or dark then: which of the other rays were reflected is unknown.
     """
     center = np.array(rig.pattern.marker or rig.pattern.center_ray)
-    ray = center + (match.ray - center) * ways(match.orientation) * ways(orientation)
+    ray = center + (match.ray - center) * signs_of(match.orientation) * signs_of(orientation)
     there = ((ray >= 1) & (ray <= (rig.pattern.rows, rig.pattern.columns))).all(axis=-1)
     return replace(
         match,
@@ -41,7 +41,7 @@ def with_orientation(match: Match, rig: Rig, orientation: Orientation) -> Match:
         reflected=match.reflected[there],
         plane_mm=match.plane_mm[there],
         plane_covariance_mm2=match.plane_covariance_mm2[there],
-        witness=np.zeros_like(match.witness),
+        ray_states=np.zeros_like(match.ray_states),
     )
 
 

@@ -91,8 +91,8 @@ def recorded(
         ray, noise = np.argwhere(shown) + 1, rng.normal(0, sigma_px, (int(shown.sum()), 2))
         dots = known.axes.calibration.to_plane(image_px[shown] + noise)
         covariance = np.broadcast_to((sigma_px / PX_PER_MM) ** 2 * np.eye(2), (len(ray), 2, 2))
-        witness = np.where(shown, 1, np.where(reflections.lit | reflections.absent, 0, -1))
-        match = MatchedDots(ray, dots, covariance, witness, MISSING)
+        ray_states = np.where(shown, 1, np.where(reflections.lit | reflections.absent, 0, -1))
+        match = MatchedDots(ray, dots, covariance, ray_states, MISSING)
         try:
             pool_fit = fit_pool(match, exact, FitSettings(), near, weigh_by_height_sigma=True)
         except CannotMeasure as error:

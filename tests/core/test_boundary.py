@@ -81,18 +81,18 @@ def test_pool_wider_than_the_pattern_ends_half_a_step_beyond_it():
     np.testing.assert_allclose(edges.right_mm[k], landing[full_rows[0], 18] + step / 2, atol=0.01)
 
 
-def test_rows_whose_end_ray_has_unknown_witness_are_skipped():
+def test_rows_whose_end_ray_is_in_an_unknown_state_are_skipped():
     match = match_of(spherical_cap(6.5, 0.4))
     row = 11
     last = match.ray[match.ray[:, 0] == row, 1].max()
-    witness = match.witness.copy()
-    witness[row - 1, last] = 0
+    ray_states = match.ray_states.copy()
+    ray_states[row - 1, last] = 0
     y = edge_points(match, RIG).left_mm[:, 1]
-    remaining = edge_points(replace(match, witness=witness), RIG).left_mm[:, 1]
+    remaining = edge_points(replace(match, ray_states=ray_states), RIG).left_mm[:, 1]
     assert len(remaining) == len(y) - 1
     assert set(np.round(remaining, 9)) < set(np.round(y, 9))
     # They are used if no others are left.
-    unknown = edge_points(replace(match, witness=np.zeros_like(witness)), RIG)
+    unknown = edge_points(replace(match, ray_states=np.zeros_like(ray_states)), RIG)
     assert len(unknown.left_mm) == len(y)
 
 

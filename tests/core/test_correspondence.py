@@ -12,7 +12,7 @@ import pytest
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import DotPattern, Laser, Rig
 from labapp.core.images.dots import Dots
-from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
+from labapp.core.match import ORIENTATIONS, Match, Orientation, signs_of
 from labapp.core.matching import match_rays as match_rays_module
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.match_rays import lattice_of_match, match_rays
@@ -181,15 +181,15 @@ def test_match_is_consistent(scene_results: list[SceneResult]) -> None:
     for scene, match in with_match(scene_results):
         assert len(np.unique(match.dot)) == len(match.dot)
         assert len(np.unique(match.ray, axis=0)) == len(match.ray)
-        labelled = np.zeros(match.witness.shape, bool)
+        labelled = np.zeros(match.ray_states.shape, bool)
         labelled[tuple(match.ray.T - 1)] = True
-        np.testing.assert_array_equal(match.witness > 0, labelled)
+        np.testing.assert_array_equal(match.ray_states > 0, labelled)
         plane_mm = BENCH_VIEW.to_plane(scene.seen.dots.image_px[match.dot])
         np.testing.assert_allclose(match.plane_mm, plane_mm)
         assert (np.linalg.eigvalsh(match.plane_covariance_mm2) > 0).all()
         # Reflected numbers start at 1; the orientation gives their direction.
         assert match.reflected.min(axis=0).tolist() == [1, 1]
-        offset = match.reflected - match.ray * ways(match.orientation)
+        offset = match.reflected - match.ray * signs_of(match.orientation)
         assert (offset == offset[0]).all()
 
 
@@ -199,7 +199,7 @@ def test_rays_marked_as_dark_have_no_dot(scene_results: list[SceneResult]) -> No
     # the rim do not count: matching cannot know that they existed.
     dark_count = came_back = 0
     for scene, match in with_match(scene_results):
-        dark = match.witness < 0
+        dark = match.ray_states < 0
         dark_count += int(dark.sum())
         taken_out = scene.reflections.visible.copy()
         taken_out[tuple(scene.seen.ray[scene.seen.ray[:, 0] > 0].T - 1)] = False
@@ -218,8 +218,8 @@ def test_only_dots_with_a_ray_are_indexed(scene_results: list[SceneResult]) -> N
         expected[match.dot] = match.reflected
         np.testing.assert_array_equal(np.stack([lattice.row, lattice.column], axis=-1), expected)
         center = np.array(scene.rig.pattern.center_ray)
-        offset = match.reflected[0] - match.ray[0] * ways(match.orientation)
-        assert lattice.reference == tuple(center * ways(match.orientation) + offset)
+        offset = match.reflected[0] - match.ray[0] * signs_of(match.orientation)
+        assert lattice.reference == tuple(center * signs_of(match.orientation) + offset)
 
 
 CONVEX = egg(6.2, 2.8, 3.6, 0.32)
@@ -362,10 +362,10 @@ def corrected(correction: Correction, settings: MatchSettings | None = None) -> 
 def by_hand(seen: SeenDots, orientation: Orientation = "S/S") -> tuple[Correction, Site]:
     """Return the true rows and columns as a manual correction, and the reference's site."""
     real = seen.ray[:, 0] > 0
-    number = seen.ray * ways(orientation)
+    number = seen.ray * signs_of(orientation)
     step = 1 - number[real].min(axis=0)
     site = np.where(real[:, None], number + step, 0)
-    k, t = (np.array([10, 10]) * ways(orientation) + step).tolist()
+    k, t = (np.array([10, 10]) * signs_of(orientation) + step).tolist()
     return Correction.of(seen.dots, Lattice(site[:, 0], site[:, 1])), (k, t)
 
 
@@ -503,15 +503,15 @@ def test_dark_rays_of_blocked_rows_are_ignored() -> None:
     correction, reference = by_hand(seen)
     correction = set_reference(correction, reference)
     silent = behind - set(map(tuple, exact(CONVEX).ray.tolist()))
-    misled = corrected(correction).witness
+    misled = corrected(correction).ray_states
     assert any(misled[i - 1, j - 1] < 0 for i, j in behind - silent)
     for i in (6, 7):
         correction = block_row(correction, reference[0] + i - 10)
     match = corrected(correction)
-    rows = match.witness[5:7]
+    rows = match.ray_states[5:7]
     assert set(np.unique(rows)) == {0, 1}
     np.testing.assert_array_equal(
-        np.delete(match.witness, (5, 6), 0) > 0, np.delete(misled, (5, 6), 0) > 0
+        np.delete(match.ray_states, (5, 6), 0) > 0, np.delete(misled, (5, 6), 0) > 0
     )
 
 

@@ -221,8 +221,8 @@ def test_row_possibly_out_of_view_is_not_dark() -> None:
     pool, seen = draw(OUT_OF_VIEW)
     row = slice(8, 12)
     match = matched(seen)
-    assert (match.witness[12, row] == 0).all()
-    assert (match.witness[10, [3, 16]] == -1).all()  # dark, and far within the view
+    assert (match.ray_states[12, row] == 0).all()
+    assert (match.ray_states[10, [3, 16]] == -1).all()  # dark, and far within the view
     size = measure_surface(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
     assert abs(size.height_mm - pool.size.height_mm) < 2 * size.height_sigma_mm
 

@@ -168,11 +168,11 @@ def fitted_frames(pool, count, rate_hz, rng):
     for k in range(count):
         traced = still or trace(pool.after(k / rate_hz), OPEN_RIG)
         match = exact_match(traced, OPEN_RIG, None, 0.03, rng)
-        present, witness = rng.random(len(match.ray)) > 0.01, match.witness.copy()
-        witness[tuple(match.ray[~present].T - 1)] = 0
+        present, ray_states = rng.random(len(match.ray)) > 0.01, match.ray_states.copy()
+        ray_states[tuple(match.ray[~present].T - 1)] = 0
         per_dot = ("ray", "dot", "reflected", "plane_mm", "plane_covariance_mm2")
         remaining = {name: getattr(match, name)[present] for name in per_dot}
-        match = replace(match, witness=witness, **remaining)
+        match = replace(match, ray_states=ray_states, **remaining)
         fitted = fit.fit_surface(match, OPEN_RIG, FitSettings(), near)
         reconstruction, sizes = fit.bound_and_measure(match, fitted, OPEN_RIG, FitSettings())
         near = fitted.surface

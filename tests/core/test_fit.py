@@ -250,8 +250,8 @@ def test_sizes_have_uncertainties_where_last_rows_are_hidden() -> None:
     pool = egg(7.16, 3.78, 4.62, 0.131)
     match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG, sigma_mm=0.12, rng=rng)
     hidden = match.ray[:, 0] < match.ray[:, 0].min() + 2
-    witness = match.witness.copy()
-    witness[tuple(match.ray[hidden].T - 1)] = 0
+    ray_states = match.ray_states.copy()
+    ray_states[tuple(match.ray[hidden].T - 1)] = 0
     match = replace(
         match,
         dot=match.dot[~hidden],
@@ -259,7 +259,7 @@ def test_sizes_have_uncertainties_where_last_rows_are_hidden() -> None:
         reflected=match.reflected[~hidden],
         plane_mm=match.plane_mm[~hidden],
         plane_covariance_mm2=match.plane_covariance_mm2[~hidden],
-        witness=witness,
+        ray_states=ray_states,
     )
     reconstruction = fit.reconstruct(match, OPEN_RIG, FitSettings())
     size = measure_surface(reconstruction, match, OPEN_RIG)

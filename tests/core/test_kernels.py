@@ -775,16 +775,16 @@ def test_quadrics_are_fitted_to_dots(lit: list[int]) -> None:
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.004, 0.3])
-@pytest.mark.parametrize("witnesses", [1, 90, 2 * level_kernels.RAYS_PER_LOG + 7])
-def test_level_likelihood_agrees_with_numpy(witnesses: int, missing: float) -> None:
+@pytest.mark.parametrize("known_rays", [1, 90, 2 * level_kernels.RAYS_PER_LOG + 7])
+def test_level_likelihood_agrees_with_numpy(known_rays: int, missing: float) -> None:
     # Some heights are so far off that a plain exponential would overflow; one has no slope.
-    over = random().normal(0.0, 0.1, (3, witnesses))
+    over = random().normal(0.0, 0.1, (3, known_rays))
     over[:, ::3] = over[0, ::3]  # at the head the drop of the rear changes nothing
-    side = random().choice([-1.0, 1.0], witnesses) / random().uniform(0.01, 0.04, witnesses)
+    side = random().choice([-1.0, 1.0], known_rays) / random().uniform(0.01, 0.04, known_rays)
     side[0] = 0.0
     levels, blurs = np.linspace(-0.05, 0.07, 31), np.array([0.005, 0.04, 0.25])
-    dark = random().uniform(size=witnesses) < 0.4
-    spread = np.where(random().uniform(size=witnesses) < 0.5, 0.0, 0.03)
+    dark = random().uniform(size=known_rays) < 0.4
+    spread = np.where(random().uniform(size=known_rays) < 0.5, 0.0, 0.03)
     computed = level_kernels.level_negative_log_likelihood(
         over, side, dark, spread, missing, (levels[0], levels[1] - levels[0], 31),
         np.stack([blurs, np.zeros(3)]),

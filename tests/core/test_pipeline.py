@@ -170,7 +170,7 @@ def test_measure_uses_the_scheme_of_the_settings(
     # Up to the reconstruction nothing depends on the scheme; all results are reproducible.
     assert default.match is not None
     assert other.match is not None
-    for name in ("dot", "ray", "plane_mm", "witness"):
+    for name in ("dot", "ray", "plane_mm", "ray_states"):
         np.testing.assert_array_equal(getattr(default.match, name), getattr(other.match, name))
     assert default.match.trials == other.match.trials
     again = reconstruct(other.match, SETUP.rig, Settings())
@@ -193,7 +193,7 @@ def test_unchanged_correction_changes_no_figure(
     np.testing.assert_array_equal(again.lattice.row, original.lattice.row)
     assert again.match is not None
     assert original.match is not None
-    np.testing.assert_array_equal(again.match.witness, original.match.witness)
+    np.testing.assert_array_equal(again.match.ray_states, original.match.ray_states)
 
 
 def test_false_dot_is_deleted_and_missing_one_added_manually(

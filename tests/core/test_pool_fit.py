@@ -20,7 +20,7 @@ from labapp.core.geometry.optics import (
 from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.match import Match
 from labapp.core.schemes import fit
-from labapp.core.surface.level import Level, LevelSearch, Rear, Witnesses
+from labapp.core.surface.level import KnownRays, Level, LevelSearch, Rear
 from labapp.core.surface.measures import WITH_SIGMA
 from labapp.core.surface.pool_fit import (
     FitSettings,
@@ -59,9 +59,9 @@ def rays_landing(spacing: float, seed: int = 0) -> tuple[FloatArray, IntArray]:
     return landing, np.where(np.linalg.norm(landing, axis=-1) < RADIUS, 1, -1)
 
 
-def level_of(landing: FloatArray, witness: IntArray, spacing: float, sign: int = 1) -> Level:
+def level_of(landing: FloatArray, ray_states: IntArray, spacing: float, sign: int = 1) -> Level:
     height, slope = dome(sign).height_and_gradient(*landing.T)
-    seen = np.stack([height, 0 * height]), slope, landing[:, 1], witness
+    seen = np.stack([height, 0 * height]), slope, landing[:, 1], ray_states
     return find_level(*seen, np.array([spacing, spacing]))
 
 
@@ -77,18 +77,18 @@ def match() -> Match:
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("seed", range(4))
 def test_contour_is_between_lit_and_dark_rays(sign: int, seed: int) -> None:
-    landing, witness = rays_landing(0.45, seed)
-    level = level_of(landing, witness, 0.45, sign)
+    landing, ray_states = rays_landing(0.45, seed)
+    level = level_of(landing, ray_states, 0.45, sign)
     assert level.pool_sign == sign
     height = sign * (dome(sign).height(*landing.T) + level.shift_mm)
-    assert height[witness > 0].min() > height[witness < 0].max()
-    assert height[witness > 0].min() > -level.sigma_mm
-    assert height[witness < 0].max() < level.sigma_mm
+    assert height[ray_states > 0].min() > height[ray_states < 0].max()
+    assert height[ray_states > 0].min() > -level.sigma_mm
+    assert height[ray_states < 0].max() < level.sigma_mm
     assert abs(level.shift_mm + 0.5) < 4 * level.sigma_mm
     assert level.disagreement_bits < 0.15
 
 
-def test_more_witnesses_reduce_the_level_uncertainty() -> None:
+def test_more_known_rays_reduce_the_level_uncertainty() -> None:
     sigmas, errors = [], []
     for spacing in (1.0, 0.5, 0.25):
         levels = [level_of(*rays_landing(spacing, seed), spacing) for seed in range(8)]
@@ -101,14 +101,14 @@ def test_more_witnesses_reduce_the_level_uncertainty() -> None:
 
 
 @pytest.mark.parametrize("lies", ["dark inside", "lit outside"])
-def test_single_false_witness_hardly_moves_the_level(lies: str) -> None:
-    landing, witness = rays_landing(0.45)
-    original = level_of(landing, witness, 0.45)
+def test_single_false_state_hardly_moves_the_level(lies: str) -> None:
+    landing, ray_states = rays_landing(0.45)
+    original = level_of(landing, ray_states, 0.45)
     radius = np.linalg.norm(landing, axis=-1)
     flipped = np.argmin(np.abs(radius - (RADIUS - 0.9 if lies == "dark inside" else RADIUS + 0.9)))
-    witness = witness.copy()
-    witness[flipped] *= -1
-    level = level_of(landing, witness, 0.45)
+    ray_states = ray_states.copy()
+    ray_states[flipped] *= -1
+    level = level_of(landing, ray_states, 0.45)
     assert level.pool_sign == 1
     # A ray's spacing is 0.3 × 0.45 mm of height at the contour.
     assert abs(level.shift_mm - original.shift_mm) < 0.15 * 0.3 * 0.45
@@ -118,8 +118,8 @@ def test_single_false_witness_hardly_moves_the_level(lies: str) -> None:
 
 def test_boundary_contradicting_the_surface_is_less_certain() -> None:
     # A concave pool is used, as a convex one that seems too long may have a low rear.
-    landing, witness = rays_landing(0.45)
-    original = level_of(landing, witness, 0.45, -1)
+    landing, ray_states = rays_landing(0.45)
+    original = level_of(landing, ray_states, 0.45, -1)
     squeezed = np.where(np.linalg.norm(landing * [1.15, 0.87], axis=-1) < RADIUS, 1, -1)
     level = level_of(landing, squeezed, 0.45, -1)
     assert level.sigma_mm > 2 * original.sigma_mm
@@ -224,14 +224,17 @@ def part(match: Match, selected: FloatArray | IntArray) -> Match:
 
 
 def test_boundary_is_open_without_dark_rays(match: Match) -> None:
-    assert rejected_status(replace(match, witness=np.maximum(match.witness, 0))) == "open-boundary"
+    assert (
+        rejected_status(replace(match, ray_states=np.maximum(match.ray_states, 0)))
+        == "open-boundary"
+    )
 
 
 def test_boundary_is_open_where_the_rear_is_not_visible(match: Match) -> None:
-    witness = match.witness.copy()
-    witness[:9] = 0
+    ray_states = match.ray_states.copy()
+    ray_states[:9] = 0
     head = part(match, np.flatnonzero(match.ray[:, 0] > 9))
-    assert rejected_status(replace(head, witness=witness)) == "open-boundary"
+    assert rejected_status(replace(head, ray_states=ray_states)) == "open-boundary"
 
 
 @pytest.mark.parametrize("count", [0, 1, 5])
@@ -254,7 +257,9 @@ def test_garbage_gives_a_surface_or_a_reason(seed: int, noise_mm: float) -> None
     garbage = replace(
         good,
         plane_mm=good.plane_mm + rng.normal(0.0, noise_mm, good.plane_mm.shape),
-        witness=np.where(rng.random(good.witness.shape) < 0.1, -good.witness, good.witness),
+        ray_states=np.where(
+            rng.random(good.ray_states.shape) < 0.1, -good.ray_states, good.ray_states
+        ),
     )
     try:
         reconstruction = fit.reconstruct(garbage, OPEN_RIG, FitSettings())
@@ -276,9 +281,9 @@ def test_dots_with_wrong_rays_are_rejected(match: Match, seed: int) -> None:
 
 @pytest.mark.parametrize("off_mm", [0.02, -0.08, 0.3])
 def test_level_is_found_wherever_the_search_begins(off_mm: float) -> None:
-    landing, witness = rays_landing(0.45)
+    landing, ray_states = rays_landing(0.45)
     height, slope = dome().height_and_gradient(*landing.T)
-    seen = np.stack([height, 0 * height]), slope, landing[:, 1], witness
+    seen = np.stack([height, 0 * height]), slope, landing[:, 1], ray_states
     known = find_level(*seen, np.array([0.45, 0.45]))
     about = known.shift_mm + off_mm, known.pool_sign, 0.3
     found = find_level(*seen, np.array([0.45, 0.45]), about=about)
@@ -288,9 +293,9 @@ def test_level_is_found_wherever_the_search_begins(off_mm: float) -> None:
 
 def test_single_row_of_lit_rays_has_a_level() -> None:
     height, slope = np.array([0.1, 0.2, 0.1, -0.1, -0.1]), np.full((5, 2), 0.1)
-    y, witness = np.array([1.0, 1.0, 1.0, 2.0, 0.0]), np.array([1, 1, 1, -1, -1])
+    y, ray_states = np.array([1.0, 1.0, 1.0, 2.0, 0.0]), np.array([1, 1, 1, -1, -1])
     exact = np.stack([height, 0 * height])
-    level = find_level(exact, slope, y, witness, np.array([0.4, 0.8]))
+    level = find_level(exact, slope, y, ray_states, np.array([0.4, 0.8]))
     assert np.isfinite([level.shift_mm, level.sigma_mm]).all()
     assert level.rear.drop_mm == 0.0
 
@@ -300,9 +305,9 @@ def test_rear_sinks_although_no_dark_ray_is_seen_there() -> None:
     for drop_mm in 0.0, 0.1:
         pool = egg(6.6, 3.0, 3.9, 0.33, terms=(LowRear(drop_mm),))
         match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG)
-        witness = match.witness.copy()
-        witness[(witness < 0) & (np.arange(1, 20)[:, None] < match.ray[:, 0].min() + 2)] = 0
-        match = replace(match, witness=witness)
+        ray_states = match.ray_states.copy()
+        ray_states[(ray_states < 0) & (np.arange(1, 20)[:, None] < match.ray[:, 0].min() + 2)] = 0
+        match = replace(match, ray_states=ray_states)
         fitted = fit.fit_surface(match, OPEN_RIG, FitSettings())
         made, found = fit.bound_and_measure(match, fitted, OPEN_RIG, FitSettings())
         assert (fitted.level.rear.drop_mm > 0.03) == (drop_mm > 0)
@@ -326,7 +331,7 @@ def test_held_drop_keeps_its_uncertainty(match: Match) -> None:
     basis = basis_around(points[:, :2], rays, settings.knot_mm)
     seen = match.plane_mm, match.plane_covariance_mm2
     equations = normal_equations(basis, OPEN_RIG, points, *seen, settings)
-    witnesses = Witnesses.of(rays, 1, match.witness, basis, 0.0)
+    known_rays = KnownRays.of(rays, 1, match.ray_states, basis, 0.0)
     held = replace(
         fitted(match).level, sigma_mm=0.02, drop_sigma_mm=0.03, drop_covariance_mm2=-3e-4
     )
@@ -335,7 +340,7 @@ def test_held_drop_keeps_its_uncertainty(match: Match) -> None:
         rounds = Rounds(
             equations, rays.directions[tuple(at)], np.zeros(basis.count), points, np.inf
         )
-        found[is_free] = rounds.run(3, 0.0, search=LevelSearch(witnesses, held, is_free))
+        found[is_free] = rounds.run(3, 0.0, search=LevelSearch(known_rays, held, is_free))
     assert (found[False].drop_sigma_mm, found[False].drop_covariance_mm2) == (0.03, -3e-4)
     assert found[False].sigma_mm == 0.02
     assert found[True].drop_sigma_mm < 0.02
@@ -365,11 +370,11 @@ def test_uncertain_heights_count_less_for_the_level() -> None:
     exact, weighed = [], []
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        landing, witness = rays_landing(0.5, seed)
+        landing, ray_states = rays_landing(0.5, seed)
         height, slope = dome().height_and_gradient(*landing.T)
         sigma = np.where(landing[:, 0] > 1.5, 0.04, 1e-4)
         height += sigma * rng.normal(size=len(height))
-        seen = slope, landing[:, 1], witness, np.array([0.5, 0.5])
+        seen = slope, landing[:, 1], ray_states, np.array([0.5, 0.5])
         for levels, known in (exact, 0 * sigma), (weighed, sigma):
             level = find_level(np.stack([height, known]), *seen, rear=(1, 0.0))
             levels.append([level.shift_mm + 0.5, level.sigma_mm])

@@ -17,7 +17,7 @@ from labapp.core.matching.observation import (
     try_fit,
     widened,
 )
-from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
+from labapp.core.matching.ray_classes import RayClasses, certain_states, classify_rays
 from labapp.core.values import BoolArray, FloatArray, IntArray
 from labapp.simulation.pools import egg, spherical_cap
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, see, true_labels
@@ -52,11 +52,11 @@ def test_true_labels_leave_nothing_unexplained(frame: tuple[Observation, IntArra
     observed, labels = frame
     found, lit = classes(observed, labels), labels != UNLABELLED
     assert (len(found.missed), len(found.stray)) == (0, 0)
-    assert (found.witness[lit] == 1).all()
-    assert not (found.witness[~lit] > 0).any()
-    assert (found.witness[observed.rays.absent] == 0).all()
+    assert (found.ray_states[lit] == 1).all()
+    assert not (found.ray_states[~lit] > 0).any()
+    assert (found.ray_states[observed.rays.absent] == 0).all()
     # Rays that land well outside the pool have no dot, but some of them cross the view.
-    assert (found.witness < 0).sum() > 20
+    assert (found.ray_states < 0).sum() > 20
 
 
 def test_missing_dot_is_a_missed_ray(frame: tuple[Observation, IntArray]) -> None:
@@ -76,7 +76,7 @@ def test_missing_dot_is_a_missed_ray(frame: tuple[Observation, IntArray]) -> Non
     found = classify_rays(fewer, others, paths_of(fewer, pool))
     assert found.missed.tolist() == [np.ravel_multi_index(tuple(ray), labels.shape)]
     assert len(found.stray) == 0
-    assert found.witness[tuple(ray)] == 0
+    assert found.ray_states[tuple(ray)] == 0
 
 
 def test_dot_without_label_is_stray_and_its_ray_not_dark(
@@ -90,7 +90,7 @@ def test_dot_without_label_is_stray_and_its_ray_not_dark(
         fewer[tuple(ray)] = UNLABELLED
         found = classes(observed, fewer)
         assert found.stray.tolist() == [labels[tuple(ray)]]
-        assert found.witness[tuple(ray)] == 0
+        assert found.ray_states[tuple(ray)] == 0
 
 
 def test_merged_dots_are_neither_missed_nor_stray(frame: tuple[Observation, IntArray]) -> None:
@@ -101,13 +101,13 @@ def test_merged_dots_are_neither_missed_nor_stray(frame: tuple[Observation, IntA
     blurred = replace(observed, size_mm=np.full(len(observed.size_mm), 50.0))
     found = classes(blurred, fewer)
     assert (len(found.missed), len(found.stray)) == (0, 0)
-    assert not (found.witness < 0).any()
+    assert not (found.ray_states < 0).any()
 
 
 def test_rays_behind_the_torch_are_not_dark() -> None:
-    seen = classes(*observed_on(BENCH_RIG)).witness
+    seen = classes(*observed_on(BENCH_RIG)).ray_states
     low = replace(BENCH_RIG.electrode, height_mm=-50.0)
-    behind = classes(*observed_on(replace(BENCH_RIG, electrode=low))).witness
+    behind = classes(*observed_on(replace(BENCH_RIG, electrode=low))).ray_states
     assert (seen < 0).any()
     assert not (behind < 0).any()
     assert ((behind > 0) == (seen > 0)).all()
@@ -118,7 +118,7 @@ def test_rays_out_of_view_are_not_dark(frame: tuple[Observation, IntArray]) -> N
     width, height = observed.plane_mm.max(axis=0)
     narrow = replace(observed.rig.imaging_plane, width_mm=width, height_mm=height)
     cropped, _ = observed_on(replace(BENCH_RIG, imaging_plane=narrow))
-    wide, tight = classes(observed, labels).witness, classes(cropped, labels).witness
+    wide, tight = classes(observed, labels).ray_states, classes(cropped, labels).ray_states
     assert (tight < 0).sum() < (wide < 0).sum()
 
 
@@ -129,8 +129,8 @@ def test_false_dot_beside_the_plane_does_not_widen_the_view(
     pool = try_fit(observed, labels, USUAL_FIT)
     assert pool is not None
     paths = paths_of(observed, pool)
-    witness = classify_rays(observed, labels, paths).witness
-    dark = np.flatnonzero((witness < 0) & widened(witness > 0, 1))
+    ray_states = classify_rays(observed, labels, paths).ray_states
+    dark = np.flatnonzero((ray_states < 0) & widened(ray_states > 0, 1))
     right = paths.plane_mm[dark, 0].max()
     narrow = replace(observed.rig.imaging_plane, width_mm=observed.plane_mm[:, 0].max() + 1.0)
     assert right > narrow.width_mm
@@ -141,22 +141,22 @@ def test_false_dot_beside_the_plane_does_not_widen_the_view(
         covariance_mm2=np.concatenate([cropped.covariance_mm2, cropped.covariance_mm2[-2:]]),
         size_mm=np.append(cropped.size_mm, cropped.size_mm[-2:]),
     )
-    found, without = (classify_rays(one, labels, paths).witness for one in (with_false, cropped))
+    found, without = (classify_rays(one, labels, paths).ray_states for one in (with_false, cropped))
     assert (found.flat[dark] < 0).sum() > (without.flat[dark] < 0).sum()
 
     def exact(rays: IntArray) -> FloatArray:
         return np.zeros((len(rays), 2, 2))
 
-    certain, expected = (certain_witness(one, found, paths, exact) for one in (with_false, cropped))
+    certain, expected = (certain_states(one, found, paths, exact) for one in (with_false, cropped))
     np.testing.assert_array_equal(certain, expected)
     # A labelled ray at the rim may leave the splines.
     plane = paths.plane_mm.copy()
     plane[np.flatnonzero(found > 0)[0]] = np.nan
-    beyond = certain_witness(with_false, found, replace(paths, plane_mm=plane), exact)
+    beyond = certain_states(with_false, found, replace(paths, plane_mm=plane), exact)
     np.testing.assert_array_equal(beyond, certain)
     # Rows and columns whose predictions are uncertain by 2 mm may have left the view as well.
     rough, expected = (
-        certain_witness(one, found, paths, lambda rays: exact(rays) + 4 * np.eye(2))
+        certain_states(one, found, paths, lambda rays: exact(rays) + 4 * np.eye(2))
         for one in (with_false, cropped)
     )
     np.testing.assert_array_equal(rough, expected)

@@ -56,12 +56,12 @@ def frames(truth, count=8, seed=0, noise_mm=0.02, growth=0.0, lens=lambda plane_
         dots = lens(reflections.plane_mm[reflections.visible]) + rng.normal(
             0, noise_mm, (len(ray), 2)
         )
-        witness = np.where(
+        ray_states = np.where(
             reflections.visible, 1, np.where(reflections.lit | reflections.absent, 0, -1)
         )
         covariance = np.broadcast_to(noise_mm**2 * np.eye(2), (len(ray), 2, 2))
         index = np.arange(len(ray))
-        match = Match("S/S", index, ray, np.zeros_like(ray), dots, covariance, witness)
+        match = Match("S/S", index, ray, np.zeros_like(ray), dots, covariance, ray_states)
         reconstruction = fit.reconstruct(match, EXACT, FitSettings())
         yield Measurement("ok", "", "fit", match=match, reconstruction=reconstruction)
 

@@ -37,8 +37,8 @@ def frames(count: int, seed: int = 0) -> list[Measurement]:
 def slipped(right: Measurement, by: tuple[int, int]) -> Measurement:
     """Return the frame's measurement with all rays off by some rows and columns."""
     assert right.match is not None
-    witness = np.roll(right.match.witness, by, (0, 1))
-    match = replace(right.match, ray=right.match.ray + by, witness=witness)
+    ray_states = np.roll(right.match.ray_states, by, (0, 1))
+    match = replace(right.match, ray=right.match.ray + by, ray_states=ray_states)
     surface = fit.reconstruct(match, BENCH_RIG, SETTINGS.fit)
     return replace(right, match=match, reconstruction=surface)
 

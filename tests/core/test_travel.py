@@ -37,11 +37,11 @@ def test_level_of_a_mirrored_pool_is_mirrored():
     slope = -0.04 * np.stack([x, y], axis=-1)
     # The boundary is 0.08 mm lower at the rear end, y = −4.5.
     rim = -0.08 * np.maximum(-y / 4.5, 0) ** 2
-    witness = np.where(height + rng.normal(0, 1e-3, len(x)) > rim, 1, -1)
+    ray_states = np.where(height + rng.normal(0, 1e-3, len(x)) > rim, 1, -1)
     spacing = np.array([0.4, 0.8])
     exact = np.stack([height, 0 * height])
-    forward = find_level(exact, slope, y, witness, spacing)
-    backward = find_level(exact, slope * [1, -1], -y, witness, spacing, (-1, None))
+    forward = find_level(exact, slope, y, ray_states, spacing)
+    backward = find_level(exact, slope * [1, -1], -y, ray_states, spacing, (-1, None))
     assert forward.rear.drop_mm > 0.03
     assert backward.shift_mm == pytest.approx(forward.shift_mm)
     assert backward.rear.drop_mm == pytest.approx(forward.rear.drop_mm)

@@ -15,7 +15,7 @@ from labapp.core.matching.hypothesis import USUAL_FIT, evaluate
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import sure_pairs
 from labapp.core.matching.unsupported_labels import unsupported
-from labapp.core.surface.level import Witnesses
+from labapp.core.surface.level import KnownRays
 from labapp.core.surface.pool_fit import FittedPool
 from labapp.core.values import FloatArray, IntArray
 from labapp.simulation.pools import egg
@@ -106,7 +106,7 @@ def test_false_dot_of_a_ray_outside_the_boundary_gets_no_ray() -> None:
     assert hypothesis is not None
     fitted = fitted_labels(observed, hypothesis, FIT)
     # Among the dark rays next to lit ones, that which lands farthest outside the boundary.
-    candidates = [tuple(k) for k in np.argwhere((hypothesis.witness < 0) & _beside(labels))]
+    candidates = [tuple(k) for k in np.argwhere((hypothesis.ray_states < 0) & _beside(labels))]
     landing = observed.rays.landing_mm[tuple(np.array(candidates).T)]
     height, _ = hypothesis.pool.surface.height_and_gradient(*landing[:, :2].T)
     ray = candidates[int(np.argmin(height))]
@@ -245,14 +245,14 @@ def test_reflection_far_outside_the_boundary_is_unlikely() -> None:
     height, slope = surface.height_and_gradient(x.ravel(), y.ravel())
     rise = np.linalg.norm(slope * observed.rays.spacing_mm, axis=-1).reshape(labels.shape)
     inward = height.reshape(labels.shape) / rise
-    dark = np.argwhere((hypothesis.witness < 0) & (inward < -0.5) & (inward > -2.0))
+    dark = np.argwhere((hypothesis.ray_states < 0) & (inward < -0.5) & (inward > -2.0))
 
     def evidence(sign: int) -> float:
-        witness = hypothesis.witness.copy()
-        witness[tuple(dark[0])] = sign
-        rays = observed.rays, BENCH_RIG.head_sign, witness, surface.basis, 0.01
+        ray_states = hypothesis.ray_states.copy()
+        ray_states[tuple(dark[0])] = sign
+        rays = observed.rays, BENCH_RIG.head_sign, ray_states, surface.basis, 0.01
         level = pool.level
-        return Witnesses.of(*rays).negative_log_evidence(surface.basis, surface.coefficients, level)
+        return KnownRays.of(*rays).negative_log_evidence(surface.basis, surface.coefficients, level)
 
     assert evidence(1) - evidence(-1) > 3.0
 

@@ -68,7 +68,7 @@ def measured() -> Measurement:
             reflected=np.array([[2, 5], [1, 4]]),
             plane_mm=np.zeros((2, 2)),
             plane_covariance_mm2=np.zeros((2, 2, 2)),
-            witness=np.zeros((19, 19), int),
+            ray_states=np.zeros((19, 19), int),
         ),
         reconstruction=pool(),
         measures=Measures(**sizes | {"depth_mm": -0.0, "volume_sigma_mm3": np.nan}),

@@ -109,7 +109,7 @@ def measurement_of(frame: int, scheme: str = "fit") -> Measurement:
             reflected=np.column_stack([lattice.row, lattice.column]),
             plane_mm=rng.uniform(0, 90, (n, 2)),
             plane_covariance_mm2=np.tile(np.eye(2), (n, 1, 1)),
-            witness=rng.integers(-1, 2, (19, 19)),
+            ray_states=rng.integers(-1, 2, (19, 19)),
             trials=(Trial("S/S", 0.1), Trial("I/I", 2.0)),
         ),
         reconstruction=Reconstruction(

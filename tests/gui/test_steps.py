@@ -16,7 +16,7 @@ from tests.gui.conftest import SAMPLES, CopySample
 LASER = "[laser]\nprojection_angle_deg = 31.14\ndistance_mm = 31.48\n"
 PATTERN = "[pattern]\nrows = 19\ncolumns = 19\ninter_beam_angle_deg = 0.77\n"
 TYPED = "the electrode, the imaging plane"
-CALIBRATE = "calibrate the picture (step 3)"
+CALIBRATE = "calibrate the picture (step Imaging plane)"
 
 
 @pytest.mark.parametrize(

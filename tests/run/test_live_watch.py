@@ -31,7 +31,7 @@ from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
 from labapp.run import live_measuring, live_trend, live_watch
 from labapp.run.limits import Limits, Size, standing
-from labapp.run.live_measuring import JUDGED_S, SOUGHT_S, LiveChain, LiveMeasuring, LiveResult
+from labapp.run.live_measuring import JUDGED_S, SEARCH_AFTER_S, LiveChain, LiveMeasuring, LiveResult
 from labapp.run.live_watch import LiveWatch
 from labapp.run.streams import LineStream
 from tests.waiting import PATIENCE_S, connect
@@ -378,20 +378,20 @@ def test_search_only_after_a_long_time_without_followed_frames(setup: Setup, cha
     measure, live_frame = LiveChain(setup, Settings(), 8).measure, frame(1)
     assert measure(live_frame, False) is not None  # the first
     assert chain.searched == [100.0]
-    chain.now_s += 0.9 * SOUGHT_S
+    chain.now_s += 0.9 * SEARCH_AFTER_S
     assert measure(live_frame, False) is None
     chain.is_lost = False
     followed = measure(live_frame, False)
     assert followed is not None
     assert followed.track_lost is None
     chain.is_lost = True
-    chain.now_s += 0.9 * SOUGHT_S
+    chain.now_s += 0.9 * SEARCH_AFTER_S
     assert measure(live_frame, False) is None
-    chain.now_s += 0.2 * SOUGHT_S
+    chain.now_s += 0.2 * SEARCH_AFTER_S
     searched = measure(live_frame, False)
     assert searched is not None
     assert searched.track_lost == "it jumped"
-    assert chain.skipped == pytest.approx([100 + 0.9 * SOUGHT_S, 100 + 1.8 * SOUGHT_S])
+    assert chain.skipped == pytest.approx([100 + 0.9 * SEARCH_AFTER_S, 100 + 1.8 * SEARCH_AFTER_S])
     assert chain.searched == [100.0, chain.now_s]
 
 
@@ -413,10 +413,10 @@ def test_followed_frames_are_judged_at_the_set_rate(setup: Setup, chain: Chain):
         measure(live_frame, False)
         expected += [chain.now_s] if share in (1.2, 2.3) else []
         assert chain.judged == expected
-    chain.is_lost, chain.now_s = True, chain.now_s + 1.1 * SOUGHT_S
+    chain.is_lost, chain.now_s = True, chain.now_s + 1.1 * SEARCH_AFTER_S
     for _ in range(2):  # every searched frame is judged
         measure(live_frame, False)
-        chain.now_s += 1.1 * SOUGHT_S
+        chain.now_s += 1.1 * SEARCH_AFTER_S
     assert len(chain.judged) == len(expected) + 2
 
 

@@ -410,7 +410,7 @@ def slipping(
             match = replace(
                 measurement.match,
                 ray=measurement.match.ray + np.array([1, 0]),
-                witness=np.roll(measurement.match.witness, 1, axis=0),
+                ray_states=np.roll(measurement.match.ray_states, 1, axis=0),
             )
             reconstruction = fit.reconstruct(match, rig, FitSettings())
             return replace(measurement, match=match, reconstruction=reconstruction), None

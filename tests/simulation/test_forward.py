@@ -99,14 +99,14 @@ def test_flat_mirror_is_s_s():
     assert reflections.plane_mm[9, 9, 1] == pytest.approx(50 * np.tan(np.radians(31.14)) - 3)
 
 
-def test_absent_rays_are_never_visible_and_have_no_witness():
+def test_absent_rays_are_never_visible_and_in_an_unknown_state():
     rig = rig_with(pattern=DotPattern(absent=frozenset({(10, 10), (12, 7)})))
     reflections = trace(spherical_cap(6, 0.3), rig)
     assert np.argwhere(reflections.absent).tolist() == [[9, 9], [11, 6]]
     assert reflections.hit[reflections.absent].all()
     assert not reflections.visible[reflections.absent].any()
     match = exact_match(reflections, rig)
-    assert (match.witness[reflections.absent] == 0).all()
+    assert (match.ray_states[reflections.absent] == 0).all()
 
 
 def test_torch_blocks_a_flat_mirror_as_in_eq_4_14_and_4_15():
@@ -271,12 +271,12 @@ def test_exact_match_has_the_orientation_of_the_28_caps():
         assert match.orientation == ("S/S" if pool.peak_mm > 0 else "I/I")
 
 
-def test_witnesses_of_lit_dark_and_unknown_rays():
+def test_states_of_lit_dark_and_unknown_rays():
     rig = rig_with(electrode=5.0)
     reflections = trace(spherical_cap(8, 0.8), rig)
     match = exact_match(reflections, rig)
-    assert {-1, 0, 1} == set(match.witness.flat)
-    lit, dark, unknown = (match.witness == value for value in (1, -1, 0))
+    assert {-1, 0, 1} == set(match.ray_states.flat)
+    lit, dark, unknown = (match.ray_states == value for value in (1, -1, 0))
     np.testing.assert_array_equal(np.argwhere(lit) + 1, match.ray)
     assert not reflections.hit[dark].any()
     assert (reflections.absent | (reflections.hit & (reflections.blocked | ~reflections.on_plane)))[

@@ -40,7 +40,7 @@ from labapp.cli.shared import (
     progress_shown,
     report_stale_results,
     warned,
-    with_methods,
+    with_detector_and_rows,
 )
 from labapp.core.schemes import scheme_words
 from labapp.errors import InputError, printable
@@ -284,7 +284,7 @@ def _set(
     from labapp.config.settings import check_algorithm
 
     settings: Settings = replace(session.settings, **options)  # type: ignore[arg-type]
-    settings = with_methods(settings, detector, rows)
+    settings = with_detector_and_rows(settings, detector, rows)
     if "algorithm" in options:
         check_algorithm(settings, "--algorithm")
     if settings != session.settings:

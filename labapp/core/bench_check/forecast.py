@@ -191,9 +191,9 @@ def _expected_match(rig: Rig, pool: Cap) -> Match:
     ray = np.argwhere(shown) + 1
     ground = intersect_level(rig.laser.position_mm, ray_directions(rig.laser, rig.pattern))
     outside = np.hypot(ground[..., 0], ground[..., 1]) > pool.diameter_mm / 2
-    witness = np.where(shown, 1, np.where(outside, -1, 0))
+    ray_states = np.where(shown, 1, np.where(outside, -1, 0))
     for i, j in rig.pattern.absent_rays:
-        witness[i - 1, j - 1] = 0
+        ray_states[i - 1, j - 1] = 0
     return Match(
         orientation="S/S",
         dot=np.arange(len(ray)),
@@ -201,7 +201,7 @@ def _expected_match(rig: Rig, pool: Cap) -> Match:
         reflected=ray,
         plane_mm=plane[shown],
         plane_covariance_mm2=np.tile(DOT_MM**2 * np.eye(2), (len(ray), 1, 1)),
-        witness=witness,
+        ray_states=ray_states,
     )
 
 

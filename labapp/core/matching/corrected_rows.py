@@ -14,7 +14,7 @@ import scipy
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
-from labapp.core.match import Match, Orientation, ways
+from labapp.core.match import Match, Orientation, signs_of
 from labapp.core.matching.hypothesis import (
     WIDE_FIT,
     Hypothesis,
@@ -96,9 +96,11 @@ def match_corrected(
                 "ambiguous-orientation",
                 f"{best.orientation} and {other.orientation} explain the dots equally well",
             )
-    # The witness comes from the same fit as for frames without a correction.
+    # The states of the rays come from the same fit as for frames without a correction.
     usual = evaluate(best.observed, best.hypothesis.labels)
-    final = best.hypothesis if usual is None else replace(best.hypothesis, witness=usual.witness)
+    final = (
+        best.hypothesis if usual is None else replace(best.hypothesis, ray_states=usual.ray_states)
+    )
     match = match_of_hypothesis(best.observed, final, best.orientation, reference)
     return match, final.pool.surface
 
@@ -140,7 +142,7 @@ def _bound(
     observed: Observation, given: Lattice, reference: Site, orientation: Orientation
 ) -> _Bound | None:
     """Label dots by their sites, and the others by the surface; None if no surface fits them."""
-    pattern, way, rows = observed.rig.pattern, ways(orientation), _whole_sites(given)
+    pattern, way, rows = observed.rig.pattern, signs_of(orientation), _whole_sites(given)
     marker = pattern.marker or pattern.center_ray
     hidden = (marker[0] + (k - reference[0]) * int(way[0]) for k in given.blocked_rows)
     observed = replace(observed, hidden_rows=frozenset(hidden))
@@ -176,7 +178,7 @@ def _found_reference(match: Match, rows: Lattice, rig: Rig) -> Site:
     """Site of the reference in the operator's rows, from the rays of a match."""
     pattern = rig.pattern
     site = np.stack([rows.row, rows.column], axis=-1)[match.dot]
-    away = (match.ray - (pattern.marker or pattern.center_ray)) * ways(match.orientation)
+    away = (match.ray - (pattern.marker or pattern.center_ray)) * signs_of(match.orientation)
     kinds, count = np.unique((site - away)[site[:, 0] > 0], axis=0, return_counts=True)
     if len(kinds) == 0 or count.max() < AGREED * count.sum():
         raise CannotMeasure(

@@ -199,13 +199,13 @@ def supported(observed: Observation, best: Hypothesis, fit_settings: FitSettings
 def _without(
     observed: Observation, best: Hypothesis, dots: IntArray | list[int], fit_settings: FitSettings
 ) -> Hypothesis:
-    """Remove the labels of some dots; the witness of their rays becomes unknown."""
+    """Remove the labels of some dots; the states of their rays become unknown."""
     certain = np.where(np.isin(best.labels, dots), UNLABELLED, best.labels)
     if (certain == best.labels).all():
         return best
-    witness = np.where(certain == best.labels, best.witness, 0)
+    ray_states = np.where(certain == best.labels, best.ray_states, 0)
     return replace(
-        evaluate(observed, certain, fit_settings, initial=best.pool) or best, witness=witness
+        evaluate(observed, certain, fit_settings, initial=best.pool) or best, ray_states=ray_states
     )
 
 
@@ -213,7 +213,9 @@ def _converged(observed: Observation, best: Hypothesis, fit_settings: FitSetting
     """Continue the fit of a hypothesis until it has converged as for a reconstruction."""
     until_settled = replace(fit_settings, settled_mm=FitSettings().settled_mm)
     try:
-        return replace(best, pool=observed.fit(best.labels, best.witness, until_settled, best.pool))
+        return replace(
+            best, pool=observed.fit(best.labels, best.ray_states, until_settled, best.pool)
+        )
     except CannotMeasure:
         return best
 
@@ -224,7 +226,7 @@ def fitted_labels(
     """Labels and surface of a hypothesis, as the input of `unsupported`."""
     basis, paths = best.pool.surface.basis, paths_of(observed, best.pool)
     missed = np.ravel_multi_index(tuple(best.missed_rays.T), best.labels.shape)
-    classes = RayClasses(best.witness, missed, best.stray_dots)
+    classes = RayClasses(best.ray_states, missed, best.stray_dots)
     rays = np.union1d(np.flatnonzero(best.labels != UNLABELLED), missed)
     rays = rays[np.isfinite(paths.plane_mm[rays, 0])]
     inverse = inverse_of(best.pool.factor)

@@ -339,7 +339,7 @@ def _step(
     dot = hypothesis.labels[tuple(at.T)]
     sigma = np.repeat(np.sqrt(variance_mm2(observed, dot)), 2)
     matched = MatchedDots(
-        at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot], hypothesis.witness
+        at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot], hypothesis.ray_states
     )
     residuals, coefficients = fit_changes(matched, observed.rig, USUAL_FIT, pool)
     change = residuals.reshape(len(sigma), -1)

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.match import Orientation, ways
+from labapp.core.match import Orientation, signs_of
 from labapp.core.matching.label_growth import grow_labels
 from labapp.core.matching.observation import (
     UNLABELLED,
@@ -97,8 +97,8 @@ class Hypothesis:
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
     pool
         The surface.
-    witness
-        See `Match.witness`.
+    ray_states
+        See `Match.ray_states`.
     missed_rays
         Rows and columns of the rays between lit rays that have no dot, counted from 0, shape
         (m, 2).
@@ -115,7 +115,7 @@ class Hypothesis:
 
     labels: IntArray
     pool: FittedPool
-    witness: IntArray
+    ray_states: IntArray
     missed_rays: IntArray
     stray_dots: IntArray
     marker: Marker | None
@@ -236,9 +236,9 @@ def _evaluated(
     pool = try_fit(observed, labels, initial=initial)
     if pool is None:
         return None
-    witness = classify_rays(observed, labels, paths_of(observed, pool)).witness
+    ray_states = classify_rays(observed, labels, paths_of(observed, pool)).ray_states
     try:
-        pool = observed.fit(labels, witness, fit_settings, pool)
+        pool = observed.fit(labels, ray_states, fit_settings, pool)
     except CannotMeasure:
         return None
     paths = paths_of(observed, pool)
@@ -246,7 +246,7 @@ def _evaluated(
     return Hypothesis(
         labels=labels,
         pool=pool,
-        witness=classes.witness,
+        ray_states=classes.ray_states,
         missed_rays=np.stack(np.divmod(classes.missed, labels.shape[1]), axis=-1),
         stray_dots=classes.stray,
         marker=marker,
@@ -424,7 +424,7 @@ def labels_from_lattice(
     """
     dot = np.nonzero(lattice.row > 0)[0]
     site = np.stack([lattice.row[dot], lattice.column[dot]], axis=-1)
-    return _labels_of_pairs(np.array(ray) + (site - hole) * ways(orientation), dot, shape)
+    return _labels_of_pairs(np.array(ray) + (site - hole) * signs_of(orientation), dot, shape)
 
 
 def extended_over_lattice(
@@ -436,14 +436,14 @@ def extended_over_lattice(
     dot = labels[at[:, 0], at[:, 1]]
     site = np.stack([lattice.row, lattice.column], axis=-1)
     indexed = site[dot, 0] > 0
-    offset = (at + 1 - site[dot] * ways(orientation))[indexed]
+    offset = (at + 1 - site[dot] * signs_of(orientation))[indexed]
     if len(offset) == 0:
         return None
     kinds, count = np.unique(offset, axis=0, return_counts=True)
     if count.max() < AGREED * len(offset):
         return None
     on_lattice = np.nonzero(site[:, 0] > 0)[0]
-    ray = site[on_lattice] * ways(orientation) + kinds[np.argmax(count)]
+    ray = site[on_lattice] * signs_of(orientation) + kinds[np.argmax(count)]
     sited = _labels_of_pairs(ray, on_lattice, labels.shape)
     others = np.where(np.isin(labels, on_lattice), UNLABELLED, labels)
     return np.where(sited != UNLABELLED, sited, others)
@@ -473,7 +473,7 @@ def reoriented_labels(
     """Label the same dots with another orientation: rays are mirrored about the marker."""
     at = np.argwhere(labels != UNLABELLED)
     center = np.array(observed.rig.pattern.marker or observed.rig.pattern.center_ray)
-    ray = center + (at + 1 - center) * ways(before) * ways(after)
+    ray = center + (at + 1 - center) * signs_of(before) * signs_of(after)
     return _labels_of_pairs(ray, labels[at[:, 0], at[:, 1]], labels.shape)
 
 

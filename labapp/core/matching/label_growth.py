@@ -44,7 +44,7 @@ LEAST_NEIGHBOURS = 4
 
 OUTLIER_TIMES, OUTLIER_SPACINGS = 6.0, 0.25
 """A label is an outlier if its residual exceeds both this multiple of the median residual and this
-fraction of the distance to the nearest dot."""
+fraction of the distance to the nearest dot; in tracking, to the nearest computed dot."""
 
 
 def grow_labels(

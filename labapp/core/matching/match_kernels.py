@@ -254,8 +254,8 @@ def classify_rays(
 
     Returns
     -------
-    witness, missed, stray
-        See `ray_classes.RayClasses`; the witness has shape (R,).
+    ray_states, missed, stray
+        See `ray_classes.RayClasses`; the states have shape (R,).
     """
     (points, slopes, plane), (tip, resolution) = paths, limits
     is_lit = labels >= 0
@@ -280,14 +280,14 @@ def classify_rays(
         around = around[next_apart(shown[around]) < resolution]
         stray = stray[two_nearest(candidates, shown[around])[0][:, 0] > resolution]
 
-    witness = np.zeros(len(plane), np.int64)
+    ray_states = np.zeros(len(plane), np.int64)
     unlit = np.flatnonzero(seen & ~(amid_lit | dotless)[known])
     spacing = next_apart(shown)[unlit]
     # A stray dot near a prediction may be the dot of a ray that seems dark.
     away = two_nearest(shown[unlit], candidates)[0][:, 0]
-    witness[known[unlit[(spacing >= resolution) & (away >= spacing)]]] = -1
-    witness[lit] = 1
-    return witness, missed, stray
+    ray_states[known[unlit[(spacing >= resolution) & (away >= spacing)]]] = -1
+    ray_states[lit] = 1
+    return ray_states, missed, stray
 
 
 @compiled(_f2)

@@ -33,7 +33,7 @@ from labapp.core.match import (
     RowsOpen,
     Trial,
     missing_share,
-    ways,
+    signs_of,
 )
 from labapp.core.matching.decision import (
     MISFIT_MM,
@@ -70,7 +70,7 @@ from labapp.core.matching.observation import (
     try_fit,
 )
 from labapp.core.matching.prediction import covariance_of_dots
-from labapp.core.matching.ray_classes import certain_witness
+from labapp.core.matching.ray_classes import certain_states
 from labapp.core.matching.repair import with_repaired, with_rows_beyond
 from labapp.core.matching.unexplained import (
     MOST_SCATTERED,
@@ -286,7 +286,7 @@ def _decide_with_other_setup(
         if excess < most and not mostly_equal(best.labels, free.labels):
             close.append((free.labels, excess))
     holes = with_rivals(observed, holes, best.labels, close)
-    best = replace(entered, witness=best.witness, missed_rays=best.missed_rays)
+    best = replace(entered, ray_states=best.ray_states, missed_rays=best.missed_rays)
     return best, [replace(each, cost=DOUBTFUL_SHARE * each.cost) for each in holes]
 
 
@@ -295,7 +295,7 @@ def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:
 
     They include dots that the image alone leaves in doubt, and exclude dots without a ray.
     """
-    way, marker = ways(match.orientation), rig.pattern.marker or rig.pattern.center_ray
+    way, marker = signs_of(match.orientation), rig.pattern.marker or rig.pattern.center_ray
     k, t = np.array(marker) * way + (match.reflected - match.ray * way)[0]
     return lattice_of_dots(match.reflected, match.dot, count, (int(k), int(t)))
 
@@ -415,9 +415,9 @@ def match_of_hypothesis(
             observed.rig, surface.basis, inverse, paths.points_mm[rays], paths.plane_mm[rays]
         )
 
-    witness = certain_witness(observed, best.witness, paths, covariance_of)
+    ray_states = certain_states(observed, best.ray_states, paths, covariance_of)
     missed = best.missed_count
-    return match_of_pairs(observed, at, dot, orientation, witness, missed, trials, marker_site)
+    return match_of_pairs(observed, at, dot, orientation, ray_states, missed, trials, marker_site)
 
 
 def match_of_pairs(
@@ -425,7 +425,7 @@ def match_of_pairs(
     at: IntArray,
     dot: IntArray,
     orientation: Orientation,
-    witness: IntArray,
+    ray_states: IntArray,
     missed: int,
     trials: Iterable[Trial],
     marker_site: Site | None = None,
@@ -440,7 +440,7 @@ def match_of_pairs(
         Row and column of each pair's ray in the pattern's arrays, counted from 0, shape (n, 2).
     dot
         Index of its dot, shape (n,).
-    orientation, witness, trials
+    orientation, ray_states, trials
         See `Match`.
     missed
         Number of rays between lit rays that have no dot.
@@ -448,7 +448,7 @@ def match_of_pairs(
         Reflected row and column (k, t) of the marker. None: rows and columns begin at 1.
     """
     pattern = observed.rig.pattern
-    numbers = (at + 1 - (pattern.marker or pattern.center_ray)) * ways(orientation)
+    numbers = (at + 1 - (pattern.marker or pattern.center_ray)) * signs_of(orientation)
     least = numbers.min(axis=0)
     numbers += 1 - least if marker_site is None else np.maximum(marker_site, 1 - least)
     return Match(
@@ -458,7 +458,7 @@ def match_of_pairs(
         reflected=numbers,
         plane_mm=observed.plane_mm[dot],
         plane_covariance_mm2=observed.covariance_mm2[dot],
-        witness=witness,
+        ray_states=ray_states,
         trials=tuple(trials),
         missing=missing_share(missed, len(dot)),
     )

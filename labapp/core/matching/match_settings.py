@@ -1,4 +1,4 @@
-"""Settings for the choice of the correspondence."""
+"""Settings of the matching."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from labapp.core.matching.hypothesis import Hypothesis
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """Settings for the choice of the correspondence.
+    """Settings of the matching.
 
     Parameters
     ----------
     correspondence
-        ``auto`` tries every orientation; otherwise the one to use. `pipeline.measure` sets it from
+        The orientation to use; ``auto`` tries every one. `pipeline.measure` sets it from
         `Settings.correspondence`.
     margin
         Two hypotheses whose costs differ by less, in units of χ², cannot be distinguished.

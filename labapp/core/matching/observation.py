@@ -137,7 +137,7 @@ class Observation(ReadOnlyArrays):
     def fit(
         self,
         labels: IntArray,
-        witness: IntArray,
+        ray_states: IntArray,
         settings: FitSettings,
         initial: FittedPool | None = None,
     ) -> FittedPool:
@@ -149,8 +149,8 @@ class Observation(ReadOnlyArrays):
         ----------
         labels
             Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
-        witness
-            See `Match.witness`. If it is 0 everywhere, the level is guessed from the outermost
+        ray_states
+            See `Match.ray_states`. If it is 0 everywhere, the level is guessed from the outermost
             labels.
         settings
             See `FitSettings`.
@@ -162,12 +162,12 @@ class Observation(ReadOnlyArrays):
         CannotMeasure
             ``no-surface``, as `fit_pool`.
         """
-        key = labels.tobytes(), witness.tobytes(), settings
+        key = labels.tobytes(), ray_states.tobytes(), settings
         if key not in self._fitted:
             at = (labels != UNLABELLED).nonzero()
             dot, ray = labels[at], np.transpose(at) + 1
             plane_mm, covariance = self.plane_mm.take(dot, 0), self.covariance_mm2.take(dot, 0)
-            matched = MatchedDots(ray, plane_mm, covariance, witness)
+            matched = MatchedDots(ray, plane_mm, covariance, ray_states)
             near = None if initial is None else initial.surface
             try:
                 pool = fit_pool(matched, self.rig, settings, near)

@@ -1,4 +1,4 @@
-"""Classification of rays as returned or not; dots and rays that a surface leaves unexplained."""
+"""Classification of rays as lit or dark; dots and rays that a surface leaves unexplained."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ class RayClasses:
 
     Parameters
     ----------
-    witness
-        +1 returned, −1 did not, 0 unknown, shape (rows, columns) (see `Match.witness`).
+    ray_states
+        +1 lit, −1 dark, 0 unknown, shape (rows, columns) (see `Match.ray_states`).
     missed
         Flat indices of the rays between lit rays that have no dot, shape (m,).
     stray
         Indices of the dots that have no ray, shape (s,).
     """
 
-    witness: IntArray
+    ray_states: IntArray
     missed: IntArray
     stray: IntArray
 
@@ -47,7 +47,7 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
     """
     from labapp.core.matching import match_kernels
 
-    witness, missed, stray = match_kernels.classify_rays(
+    ray_states, missed, stray = match_kernels.classify_rays(
         labels,
         observed.rays.absent | observed.hidden,
         (paths.points_mm, paths.slopes, paths.plane_mm),
@@ -56,16 +56,16 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
         observed.view,
         np.array([observed.rig.electrode.height_mm, observed.resolution_mm]),
     )
-    return RayClasses(witness.reshape(labels.shape), missed, stray)
+    return RayClasses(ray_states.reshape(labels.shape), missed, stray)
 
 
-def certain_witness(
+def certain_states(
     observed: Observation,
-    witness: IntArray,
+    ray_states: IntArray,
     paths: RayPaths,
     covariance_of: Callable[[IntArray], FloatArray],
 ) -> IntArray:
-    """Return the witness with dark rays set to unknown if their dots may be out of view.
+    """Return the states of rays, with dark rays set to unknown if their dots may be out of view.
 
     Beyond the last visible row the fit extrapolates smoothly, whereas the pool gets steeper towards
     its edge: the dots of the next row may lie farther out than predicted. And only labelled dots
@@ -75,23 +75,23 @@ def certain_witness(
     ----------
     observed, paths
         The frame's dots, and the ray paths for the surface.
-    witness
-        The witness of `classify_rays`.
+    ray_states
+        Those of `classify_rays`.
     covariance_of
         Function of the flat indices of rays, shape (m,), that returns the covariance of their
         dots, shape (m, 2, 2), mm².
     """
-    lit, dark = witness > 0, np.flatnonzero(witness < 0)
+    lit, dark = ray_states > 0, np.flatnonzero(ray_states < 0)
     labelled = paths.plane_mm[lit.ravel()]
     view = observed.view_with(labelled[np.isfinite(labelled[:, 0])])
-    certain = witness.copy()
+    certain = ray_states.copy()
     certain.flat[dark[~observed.in_view(paths.plane_mm[dark], view=view)]] = 0
     rim = np.flatnonzero((certain < 0) & widened(lit, 1))
     near = rim[~observed.in_view(paths.plane_mm[rim], NEAR_EDGE_MM, view)]
-    if _in_lines(near, witness.shape[1]).any():
+    if _in_lines(near, ray_states.shape[1]).any():
         margin = OUT_OF_VIEW_SIGMA * np.sqrt(covariance_of(near)[:, [0, 1], [0, 1]])
         near = near[~observed.in_view(paths.plane_mm[near], margin, view)]
-        certain.flat[near[_in_lines(near, witness.shape[1])]] = 0
+        certain.flat[near[_in_lines(near, ray_states.shape[1])]] = 0
     return certain
 
 

@@ -19,7 +19,7 @@ from labapp.core.matching.prediction import (
     false_dot_deviance,
 )
 from labapp.core.matching.ray_classes import RayClasses
-from labapp.core.surface.level import Level, Witnesses
+from labapp.core.surface.level import KnownRays, Level
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
@@ -209,12 +209,12 @@ def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> Floa
     for k in np.flatnonzero(outside):
         nats = []
         for sign in (1, -1):
-            witness = known.witness.copy()
-            witness[tuple(at[k])] = sign
-            witnesses = Witnesses.of(
-                observed.rays, observed.rig.head_sign, witness, fitted.basis, missing
+            ray_states = known.ray_states.copy()
+            ray_states[tuple(at[k])] = sign
+            known_rays = KnownRays.of(
+                observed.rays, observed.rig.head_sign, ray_states, fitted.basis, missing
             )
-            nats.append(witnesses.negative_log_evidence(fitted.basis, coefficients, level))
+            nats.append(known_rays.negative_log_evidence(fitted.basis, coefficients, level))
         odds[k] = np.exp(min(nats[1] - nats[0], 0.0))
     inside[tuple(at.T)] = odds / (1 + odds)
     return np.asarray(inside[lit])

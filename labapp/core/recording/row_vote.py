@@ -230,13 +230,13 @@ class RowVote:
 
 def _moved(match: Match, by: IntArray) -> Match:
     """Shift the rays of a match by rows and columns."""
-    size = np.array(match.witness.shape)
+    size = np.array(match.ray_states.shape)
     ray = match.ray + by
     on = ((ray >= 1) & (ray <= size)).all(axis=-1)
-    from_, to = (np.argwhere(match.witness != 0) + sign * by for sign in (0, 1))
+    from_, to = (np.argwhere(match.ray_states != 0) + sign * by for sign in (0, 1))
     inside = ((to >= 0) & (to < size)).all(axis=-1)
-    witness = np.zeros_like(match.witness)
-    witness[tuple(to[inside].T)] = match.witness[tuple(from_[inside].T)]
+    ray_states = np.zeros_like(match.ray_states)
+    ray_states[tuple(to[inside].T)] = match.ray_states[tuple(from_[inside].T)]
     return replace(
         match,
         dot=match.dot[on],
@@ -244,5 +244,5 @@ def _moved(match: Match, by: IntArray) -> Match:
         reflected=match.reflected[on],
         plane_mm=match.plane_mm[on],
         plane_covariance_mm2=match.plane_covariance_mm2[on],
-        witness=witness,
+        ray_states=ray_states,
     )

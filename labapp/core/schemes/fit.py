@@ -103,7 +103,7 @@ def fit_surface(
         raise CannotMeasure(
             "too-few-dots", f"only {len(match.ray)} dots have a ray; a surface needs {LEAST_DOTS}"
         )
-    if not (match.witness < 0).any():
+    if not (match.ray_states < 0).any():
         raise CannotMeasure("open-boundary", "no visible ray is missing: the boundary is not seen")
     pool = fit_pool(match, rig, settings, initial, weigh_by_height_sigma=True)
     if pool.unsettled_mm > UNSETTLED_MM:
@@ -120,6 +120,9 @@ def bound_and_measure(
 ) -> tuple[Reconstruction, measures.Measures]:
     """Compute the boundary, the sizes and all uncertainties of a fitted surface.
 
+    With the results for a previous frame the boundary is traced from the former one, and the part
+    of the set-up is recomputed only if a size has changed (`CHANGED`).
+
     Raises
     ------
     CannotMeasure
@@ -133,7 +136,7 @@ def bound_and_measure(
     else:
         boundary, slope = retrace_boundary(basis, coefficients, level, center, previous.boundary)
     sizes = sizes_and_gradients(basis, coefficients, level, boundary, slope)
-    if previous is not None and not sizes.holds:
+    if previous is not None and not sizes.holds:  # `trace_boundary` finds the first crossing itself
         raise CannotMeasure(
             "open-boundary", "the surface comes down to the work piece within its boundary"
         )

@@ -57,7 +57,7 @@ returns the distances of the slope-oriented points, shape (n,), mm."""
 
 @dataclass(frozen=True)
 class ReflectedRays(ReadOnlyArrays):
-    """The n rays that came back, and their reflected dots.
+    """The n lit rays, and their reflected dots.
 
     The absent centre reference is the last one if a substitute for its dot exists (§6.3.1).
 
@@ -352,7 +352,7 @@ def best_of_loops(
     Parameters
     ----------
     rays
-        The n rays that came back.
+        The n lit rays.
     move
         Step 2.
     surface_through

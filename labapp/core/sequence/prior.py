@@ -23,7 +23,7 @@ from labapp.core.surface.solver import NEWTON_STEPS, Rounds
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
-MEMORY, ORDER, TEACHERS = 32, 8, 3
+MEMORY, ORDER, STRIDE = 32, 8, 3
 """Number of past frames from which the recurrence is estimated, its maximum order, and the stride
 over lit rays: every third one is sufficient."""
 
@@ -80,7 +80,7 @@ class Prior:
         of those surfaces at the reflection points, shape (frames, R, 2).
     level_sigma_mm
         Uncertainty of the level when the drop of the rear was last fitted with it, mm.
-    by_setup
+    setup_parts
         Parts of the set-up in the uncertainty of sizes, each with the sizes for which it was
         computed: the sizes of a pool that oscillates recur.
     unseen
@@ -100,7 +100,7 @@ class Prior:
     past: FloatArray
     slopes: FloatArray
     level_sigma_mm: float
-    by_setup: tuple[SetupPart, ...]
+    setup_parts: tuple[SetupPart, ...]
     unseen: int = 0
     count: int = 0
 
@@ -111,7 +111,7 @@ class Prior:
         tuning: DetectorTuning,
         match: Match,
         pool: FittedPool,
-        made: Reconstruction,
+        reconstruction: Reconstruction,
         measures: Measures,
     ) -> Prior:
         """Build the prior from a frame that was matched without one."""
@@ -123,31 +123,31 @@ class Prior:
             cold_residual_mm=pool.residual_rms_mm,
             basis=basis,
             paths=paths,
-            lit=match.witness > 0,
-            boundary=made.boundary,
+            lit=match.ray_states > 0,
+            boundary=reconstruction.boundary,
             level=level,
             past=coefficients[None],
             slopes=paths.slopes[None],
             level_sigma_mm=level.sigma_mm,
-            by_setup=(SetupPart(made.size_sigma_setup, measures.sizes),),
+            setup_parts=(SetupPart(reconstruction.size_sigma_setup, measures.sizes),),
         )
 
-    def after(self, tracked: Tracked, made: Reconstruction, measures: Measures) -> Prior:
+    def after(self, tracked: Tracked, reconstruction: Reconstruction, measures: Measures) -> Prior:
         """Build the prior for the frame after one that was tracked with this one."""
-        by_setup, sizes = () if self.setup_is_due else self.by_setup, measures.sizes
-        if nearest_part(by_setup, sizes) is None:  # it was computed for these sizes
-            by_setup = *by_setup, SetupPart(made.size_sigma_setup, sizes)
+        setup_parts, sizes = () if self.setup_is_due else self.setup_parts, measures.sizes
+        if nearest_part(setup_parts, sizes) is None:  # it was computed for these sizes
+            setup_parts = *setup_parts, SetupPart(reconstruction.size_sigma_setup, sizes)
         paths, lit, pool = tracked.paths, tracked.lit, tracked.pool
         return replace(
             self,
             paths=paths,
             lit=lit,
-            boundary=made.boundary,
+            boundary=reconstruction.boundary,
             level=pool.level,
             past=np.vstack([self.past[1 - MEMORY :], paths.coefficients]),
             slopes=np.concatenate([self.slopes[1 - MEMORY :], paths.slopes[None]]),
             level_sigma_mm=pool.level.sigma_mm if self.drop_is_free else self.level_sigma_mm,
-            by_setup=by_setup,
+            setup_parts=setup_parts,
             unseen=0 if tracked.reference_is_seen else self.unseen + 1,
             count=self.count + 1,
         )
@@ -162,9 +162,9 @@ class Prior:
         """Whether the part of the set-up is recomputed in the next frame, whatever its sizes."""
         return self.count % SETUP_EVERY == SETUP_EVERY - 1
 
-    def known(self) -> FromPrevious:
-        """Quantities known for the next frame; slowly changing ones are recomputed at intervals."""
-        return FromPrevious(self.boundary, () if self.setup_is_due else self.by_setup)
+    def carried_over(self) -> FromPrevious:
+        """Return what `fit.bound_and_measure` takes over; the parts of the set-up only at times."""
+        return FromPrevious(self.boundary, () if self.setup_is_due else self.setup_parts)
 
     def after_gap(self) -> Prior:
         """Build the prior after a frame that was not measured: only the last surface is kept."""
@@ -215,8 +215,8 @@ def predictions(prior: Prior) -> Iterator[FloatArray]:
     """
     past, order = prior.past, min(ORDER, len(prior.past) // 2)
     if order > 2:
-        teachers = np.flatnonzero(prior.lit)[::TEACHERS]
-        ratio, mean = recurrence(prior.slopes, teachers, order), past.mean(axis=0)
+        rays = np.flatnonzero(prior.lit)[::STRIDE]
+        ratio, mean = recurrence(prior.slopes, rays, order), past.mean(axis=0)
         yield mean + ratio @ (past[: -order - 1 : -1] - mean)
     if len(past) > 1:
         yield 2 * past[-1] - past[-2]

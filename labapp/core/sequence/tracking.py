@@ -18,16 +18,17 @@ import numpy as np
 
 from labapp.core.images import band_pass_kernels
 from labapp.core.match import Trial, missing_share
+from labapp.core.matching.label_growth import OUTLIER_SPACINGS, OUTLIER_TIMES
 from labapp.core.matching.match_rays import match_of_pairs
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, amid, count_labels, widened
 from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
-from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
+from labapp.core.matching.ray_classes import RayClasses, certain_states, classify_rays
 from labapp.core.matching.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.schemes import LEAST_DOTS
 from labapp.core.schemes.fit import UNSETTLED_MM
 from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Prior, Tracked, predictions
-from labapp.core.surface.level import Level, LevelSearch, Witnesses
+from labapp.core.surface.level import KnownRays, Level, LevelSearch
 from labapp.core.surface.pool_fit import (
     FitSettings,
     fitted_pool,
@@ -53,9 +54,6 @@ and if every other prediction is farther from it by the factor `CLEARLY`."""
 RIVALS = 3
 """Number of nearest rays that are candidates for a dot, and of other dots that are candidates for a
 ray: the next ones are farther away by a row or a column."""
-
-ASTRAY = 0.25
-"""A label with a larger residual, in spacings of the computed dots, may be removed."""
 
 WORSE = 2.0
 """Maximum ratio of the residual to that of the frame that was matched without a prior."""
@@ -133,7 +131,7 @@ def track(
     trials = (Trial(orientation, pool.residual_rms_mm), *others)
     lit, missed = fit.labels != UNLABELLED, len(classes.missed)
     at = np.argwhere(lit)
-    match = match_of_pairs(observed, at, dots, orientation, classes.witness, missed, trials)
+    match = match_of_pairs(observed, at, dots, orientation, classes.ray_states, missed, trials)
     return Tracked(match, pool, paths, lit, is_seen)
 
 
@@ -298,7 +296,7 @@ def _grown(
 
 
 def _labels_near_predictions(
-    observed: Observation, paths: RayPaths, lit: BoolArray, looked_for: BoolArray
+    observed: Observation, paths: RayPaths, may_label: BoolArray, looked_for: BoolArray
 ) -> tuple[IntArray, FloatArray]:
     """Label the dots that are close to exactly one prediction.
 
@@ -306,7 +304,7 @@ def _labels_near_predictions(
     ----------
     observed, paths
         The frame's dots, and the predicted ray paths.
-    lit, looked_for
+    may_label, looked_for
         Masks of the rays that may be labelled, and of these and their rivals, shape
         (rows, columns).
 
@@ -316,7 +314,7 @@ def _labels_near_predictions(
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns); distances of the labelled
         dots from their predictions, in spacings of the predicted dots, shape (found,).
     """
-    labels = np.full(lit.shape, UNLABELLED)
+    labels = np.full(may_label.shape, UNLABELLED)
     near = np.flatnonzero(looked_for.ravel() & np.isfinite(paths.plane_mm[:, 0]))
     if len(near) < 2 or len(observed.plane_mm) < 2:
         return labels, np.empty(0)
@@ -327,7 +325,7 @@ def _labels_near_predictions(
     own, off_own = ray[:, 0], off[:, 0]
     apart, rays = step[own], near[own]
     gate = GATE * apart
-    sure = (off_own < gate) & (apart > observed.resolution_mm) & lit.ravel()[rays]
+    sure = (off_own < gate) & (apart > observed.resolution_mm) & may_label.ravel()[rays]
     sure &= (dot[own, 0] == np.arange(len(own))) & (off[:, 1] > CLEARLY * off_own)
     sure &= other[own, 1] > gate  # speckle may split a dot in two
     labels.ravel()[rays[sure]] = np.flatnonzero(sure)
@@ -346,7 +344,8 @@ def _extended_labels(fit: _Fit) -> IntArray:
     next_mm[looked_for] = band_pass_kernels.next_apart(paths.plane_mm[looked_for])
     labels, rays = fit.labels.copy().ravel(), fit.lit_rays
     off = np.hypot(*(paths.plane_mm[rays] - observed.plane_mm[labels[rays]]).T)
-    labels[rays[off > np.maximum(6.0 * median(off), ASTRAY * next_mm[rays])]] = UNLABELLED
+    allowed = np.maximum(OUTLIER_TIMES * median(off), OUTLIER_SPACINGS * next_mm[rays])
+    labels[rays[off > allowed]] = UNLABELLED
     is_free = np.ones(len(observed.plane_mm), bool)
     is_free[labels[labels != UNLABELLED]] = False
     free = np.flatnonzero(is_free)
@@ -392,18 +391,20 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     """Classify the rays, and shift the surface to the level that follows from them."""
     observed, paths = fit.observed, fit.paths()
     found = classify_rays(observed, fit.labels, paths)
-    witness = certain_witness(observed, found.witness, paths, lambda some: covariance[some])
-    if not (witness < 0).any():
+    ray_states = certain_states(observed, found.ray_states, paths, lambda some: covariance[some])
+    if not (ray_states < 0).any():
         raise TrackLost("no visible ray is missing: the boundary is not seen")
     missing = missing_share(len(found.missed), len(fit.lit_rays))
-    witnesses = Witnesses.of(observed.rays, observed.rig.head_sign, witness, prior.basis, missing)
-    sigma = fit.rounds.height_sigma_mm(witnesses.landing_mm)
-    witnesses = replace(witnesses, height_sigma_mm=sigma)
+    known_rays = KnownRays.of(
+        observed.rays, observed.rig.head_sign, ray_states, prior.basis, missing
+    )
+    sigma = fit.rounds.height_sigma_mm(known_rays.landing_mm)
+    known_rays = replace(known_rays, height_sigma_mm=sigma)
     near = replace(prior.level, shift_mm=0.0, sigma_mm=prior.level_sigma_mm)
-    search = LevelSearch(witnesses, near, prior.drop_is_free, RAISED_MM)
+    search = LevelSearch(known_rays, near, prior.drop_is_free, RAISED_MM)
     level = fit.rounds.run(fit.settings.rounds, SETTLED_MM, search=search)
     fit.check_settled()
-    return RayClasses(witness, found.missed, found.stray), level
+    return RayClasses(ray_states, found.missed, found.stray), level
 
 
 def _check_explained(classes: RayClasses, limits: MatchSettings, dots: int, rays: int) -> None:

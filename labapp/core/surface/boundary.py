@@ -142,7 +142,7 @@ def edge_points(match: Match, rig: Rig) -> EdgePoints:
 
     It lies between the landing points of the row's last ray that came back and of its outer
     neighbour that did not; the midpoint has the least mean square error. At the edge of the pattern
-    the neighbour is the ray that would be next. Rows that end at a ray with an unknown witness
+    the neighbour is the ray that would be next. Rows that end at a ray in an unknown state
     (hidden by the torch, in doubt) give no information about the boundary and are omitted, as the
     text omits fragmental rows (§7.3), unless fewer than three rows would be left.
 
@@ -156,9 +156,9 @@ def edge_points(match: Match, rig: Rig) -> EdgePoints:
         raise CannotMeasure("no-boundary", "a boundary needs at least two rows of dots")
     first = np.array([match.ray[match.ray[:, 0] == i, 1].min() for i in rows])
     last = np.array([match.ray[match.ray[:, 0] == i, 1].max() for i in rows])
-    # Beyond the pattern the witness is −1: no ray came back.
-    witness = np.pad(match.witness, 1, constant_values=-1)
-    sure = (witness[rows, first - 1] != 0) & (witness[rows, last + 1] != 0)
+    # Beyond the pattern rays are dark.
+    ray_states = np.pad(match.ray_states, 1, constant_values=-1)
+    sure = (ray_states[rows, first - 1] != 0) & (ray_states[rows, last + 1] != 0)
     if sure.sum() >= 3:
         rows, first, last = rows[sure], first[sure], last[sure]
     landing = _landings(rig)

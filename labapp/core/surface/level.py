@@ -1,7 +1,7 @@
 """Level: height of z = 0 on a surface that slopes determine up to a constant.
 
-It is estimated from the witnesses, the rays of which it is known whether they came back: a lit ray
-landed inside the boundary, a dark one outside. The boundary is on the work piece, except at the
+It is estimated from the rays that are known to be lit or dark: a lit ray landed inside the
+boundary, a dark one outside. The boundary is on the work piece, except at the
 pool's rear, which may lie below it (§7.2).
 """
 
@@ -116,28 +116,28 @@ class Level:
 
 
 @dataclass(frozen=True)
-class Witnesses(ReadOnlyArrays):
-    """The m rays of which it is known whether they came back.
+class KnownRays(ReadOnlyArrays):
+    """The m rays that are known to be lit or dark.
 
     Parameters
     ----------
     landing_mm
         Landing points on z = 0, shape (m, 3), mm.
-    witness
-        +1 came back, −1 did not, shape (m,).
+    ray_states
+        +1 lit, −1 dark, shape (m,).
     spacing_mm
         Distance between neighbouring landing points along X and along Y, shape (2,), mm.
     head_sign
         +1 where the pool's head lies towards +Y, −1 for the reverse (`Rig.head_sign`).
     missing
-        Probability that a ray that came back has no dot (`Match.missing`).
+        Probability that a reflected ray has no dot (`Match.missing`).
     height_sigma_mm
         Standard uncertainty of the surface's height there, apart from its level, shape (m,), mm.
         None: it is taken as exact.
     """
 
     landing_mm: FloatArray
-    witness: IntArray
+    ray_states: IntArray
     spacing_mm: FloatArray
     head_sign: int
     missing: float = 0.0
@@ -148,21 +148,21 @@ class Witnesses(ReadOnlyArrays):
         cls,
         rays: ProjectedRays,
         head_sign: int,
-        witness: IntArray,
+        ray_states: IntArray,
         basis: SplineBasis,
         missing: float,
-    ) -> Witnesses:
-        """Select those of `Match.witness`, shape (rows, columns), within the spline domain."""
+    ) -> KnownRays:
+        """Select the known ones of rays, shape (rows, columns), within the spline domain."""
         landing = rays.landing_mm
-        if not witness.any():
-            return cls(landing[0, :0], witness[0, :0], rays.spacing_mm, head_sign, missing)
-        known = (witness != 0) & basis.contains(landing[..., 0], landing[..., 1])
-        return cls(landing[known], witness[known], rays.spacing_mm, head_sign, missing)
+        if not ray_states.any():
+            return cls(landing[0, :0], ray_states[0, :0], rays.spacing_mm, head_sign, missing)
+        known = (ray_states != 0) & basis.contains(landing[..., 0], landing[..., 1])
+        return cls(landing[known], ray_states[known], rays.spacing_mm, head_sign, missing)
 
     def negative_log_evidence(
         self, basis: SplineBasis, coefficients: FloatArray, level: Level
     ) -> float:
-        """−log probability of the witnesses, marginalised over levels near one and blurs, nats.
+        """−log probability of their states, marginalised over levels near one and blurs, nats.
 
         The surface is at that level, and its rear is fixed. A constant is omitted.
         """
@@ -172,7 +172,7 @@ class Witnesses(ReadOnlyArrays):
         return level_kernels.negative_log_evidence(
             there[0],
             there[1:].T,
-            self.witness,
+            self.ray_states,
             self.spacing_mm,
             level.rear.height(self.landing_mm[:, 1]),
             level.pool_sign,
@@ -187,7 +187,7 @@ class LevelSearch:
 
     Parameters
     ----------
-    witnesses
+    known_rays
         Rays that determine the level.
     near
         Initial estimate of the level for the first search. None: all levels are tried.
@@ -198,10 +198,10 @@ class LevelSearch:
         After a shift of the surface by less, the level is not determined again.
     outer
         Mask of the reflection points far from their centre, shape (n,), from which the level is
-        guessed if no witness is dark (`level_kernels.guess_level`). None: it is not guessed.
+        guessed if no ray is dark (`level_kernels.guess_level`). None: it is not guessed.
     """
 
-    witnesses: Witnesses
+    known_rays: KnownRays
     near: Level | None = None
     drop_is_free: bool = True
     level_settled_mm: float = 0.0
@@ -210,20 +210,20 @@ class LevelSearch:
     @cached_property
     def for_kernel(self) -> tuple[_LevelInput, FloatArray, tuple[float, float, bool, bool, float]]:
         """The level's arguments of `rounds_kernels.run_rounds`, and the last five limits."""
-        witnesses, near, outer = self.witnesses, self.near, self.outer
-        sigma = witnesses.height_sigma_mm
+        known_rays, near, outer = self.known_rays, self.near, self.outer
+        sigma = known_rays.height_sigma_mm
         level_input = (
             np.empty(0, bool) if outer is None else outer,
-            witnesses.landing_mm,
-            witnesses.witness,
-            np.zeros(len(witnesses.witness)) if sigma is None else sigma,
-            witnesses.spacing_mm,
+            known_rays.landing_mm,
+            known_rays.ray_states,
+            np.zeros(len(known_rays.ray_states)) if sigma is None else sigma,
+            known_rays.spacing_mm,
         )
         level = near or Level(0.0, np.inf, 1, Rear(), 0.0)
         flags = self.drop_is_free, near is not None
-        limits = (witnesses.head_sign, witnesses.missing, *flags, self.level_settled_mm)
+        limits = (known_rays.head_sign, known_rays.missing, *flags, self.level_settled_mm)
         return level_input, level.as_array, limits
 
 
-NO_SEARCH = LevelSearch(Witnesses(np.empty((0, 3)), np.empty(0, np.int64), np.ones(2), 1))
+NO_SEARCH = LevelSearch(KnownRays(np.empty((0, 3)), np.empty(0, np.int64), np.ones(2), 1))
 """The mean height of the reflection points stays."""

@@ -23,7 +23,7 @@ import numpy as np
 from labapp.core.geometry.optics import ProjectedRays, project_rays
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match, MatchedDots
-from labapp.core.surface.level import Level, LevelSearch, Witnesses
+from labapp.core.surface.level import KnownRays, Level, LevelSearch
 from labapp.core.surface.solver import (
     NEWTON_STEPS,
     NormalEquations,
@@ -142,7 +142,7 @@ def fit_pool(
     Parameters
     ----------
     match
-        The n matched pairs. Without a dark ray in its ``witness`` the level is guessed.
+        The n matched pairs. Without a dark ray in its ``ray_states`` the level is guessed.
     rig
         The rig.
     settings
@@ -178,14 +178,14 @@ def fit_pool(
             initial.basis.grid, initial.coefficients, directions, points, NEWTON_STEPS
         )
     rounds = Rounds(equations, directions, np.zeros(basis.count), points, np.inf)
-    witnesses = Witnesses.of(rays, rig.head_sign, match.witness, basis, match.missing)
-    outer = None if (witnesses.witness < 0).any() else is_outer
+    known_rays = KnownRays.of(rays, rig.head_sign, match.ray_states, basis, match.missing)
+    outer = None if (known_rays.ray_states < 0).any() else is_outer
     most, until_mm = settings.rounds, settings.settled_mm
-    level = rounds.run(most, until_mm, search=LevelSearch(witnesses, outer=outer))
+    level = rounds.run(most, until_mm, search=LevelSearch(known_rays, outer=outer))
     if weigh_by_height_sigma and outer is None:
-        sigma = rounds.height_sigma_mm(witnesses.landing_mm)
-        witnesses = replace(witnesses, height_sigma_mm=sigma)
-        level = rounds.run(most, until_mm, search=LevelSearch(witnesses, level))
+        sigma = rounds.height_sigma_mm(known_rays.landing_mm)
+        known_rays = replace(known_rays, height_sigma_mm=sigma)
+        level = rounds.run(most, until_mm, search=LevelSearch(known_rays, level))
     return fitted_pool(rounds, level, rig, match.plane_mm)
 
 

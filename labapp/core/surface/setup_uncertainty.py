@@ -1,7 +1,7 @@
 """The set-up's part of the uncertainty of sizes, by linear propagation (JCGM 100, 5.1.2).
 
 The bench is perturbed by each column of a square root of its covariance, with the rays and the
-witnesses of the fit. A column is the standard uncertainty of a quantity or, if quantities are
+known rays of the fit. A column is the standard uncertainty of a quantity or, if quantities are
 correlated, one of the independent error components. The surface responds linearly: its coefficients
 solve the normal equations, so that their change follows from that of the right-hand side (implicit
 differentiation). The level depends on few rays and responds in steps: it is determined again with
@@ -65,7 +65,7 @@ def setup_changes(
     equations = _factorised(match, rig, settings, pool)
     change = _response(match.ray, equations, pool, benches) / SHARE
     basis, level, own = pool.surface.basis, pool.level, project_rays(rig.laser, rig.pattern)
-    seen = (match.witness != 0) & basis.contains(own.landing_mm[..., 0], own.landing_mm[..., 1])
+    seen = (match.ray_states != 0) & basis.contains(own.landing_mm[..., 0], own.landing_mm[..., 1])
     landing, mean = own.landing_mm[seen], pool.mean_splines
     assert equations.factor is not None
     sigma = height_sigma(basis, equations.factor, equations.inverse, mean, landing)
@@ -76,7 +76,7 @@ def setup_changes(
         basis.grid,
         pool.surface.coefficients,
         change,
-        (landing, match.witness[seen], sigma, own.spacing_mm),
+        (landing, match.ray_states[seen], sigma, own.spacing_mm),
         np.reshape(moved, (-1, *landing.shape)) / SHARE,
         np.array([rig.head_sign, level.rear.drop_mm, level.pool_sign, REACH, match.missing]),
     )

@@ -74,7 +74,7 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
     for problem in problems:
         part, _, key = problem.field.partition(".")
         if part == "image_calibration":
-            calibrate = ["calibrate the picture (step 3)"]
+            calibrate = ["calibrate the picture (step Imaging plane)"]
         elif part not in PARTS:
             wrong.append(f"take out {problem.field}: {problem.expected}")
         elif problem.value == "unknown key":
@@ -299,7 +299,9 @@ def no_surface(count: int) -> str:
 def results(facts: Facts) -> State:
     """State of a step that needs only results: ready as soon as there are any."""
     if facts.measured and facts.failed == facts.measured:
-        return State(Mark.ATTENTION, f"{no_surface(facts.measured)}: see step 6")
+        return State(
+            Mark.ATTENTION, f"{no_surface(facts.measured)}: check the {_seen(facts.session)}"
+        )
     if facts.measured:
         return State(Mark.READY, pluralize(facts.measured, "frame"))
     return State(Mark.TODO, "Measure some frames first")

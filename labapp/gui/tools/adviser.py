@@ -222,5 +222,5 @@ class AdviserWindow(ToolWindow):
             return
         if self.workspace.attempt(lambda s: presenter.use(s, advice)):
             self.workspace.notified.emit(
-                "The advised set-up is applied: calibrate laser and plane in steps 2 and 3", False
+                "The advised set-up is applied: calibrate its laser and imaging plane", False
             )

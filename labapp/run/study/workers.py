@@ -25,7 +25,7 @@ from typing import Any
 
 from labapp.errors import InputError
 from labapp.run.measurers import load_all, measuring_pool
-from labapp.simulation.parallel import POLL_S, Here, end_processes
+from labapp.simulation.parallel import POLL_S, InlineExecutor, end_processes
 from labapp.system import interrupts_blocked
 
 ATTEMPTS = 4
@@ -184,7 +184,7 @@ def local_workers(count: int | None, tasks: int) -> Iterator[Workers]:
         Number of tasks to expect: not more processes start at once, but when they are needed.
     """
     count = (os.cpu_count() or 1) if count is None else count
-    executor = _Processes(count, tasks) if count else Here()
+    executor = _Processes(count, tasks) if count else InlineExecutor()
     try:
         yield Workers(executor, lambda: max(count, 1))
     finally:

@@ -96,8 +96,8 @@ def _measurement_fits(value: Any) -> bool:
 
 
 def _match_fits(value: Any) -> bool:
-    return _all_within(value.ray[:, 0], 1, value.witness.shape[0]) and _all_within(
-        value.ray[:, 1], 1, value.witness.shape[1]
+    return _all_within(value.ray[:, 0], 1, value.ray_states.shape[0]) and _all_within(
+        value.ray[:, 1], 1, value.ray_states.shape[1]
     )
 
 
@@ -230,13 +230,14 @@ STORED = {
     "Trial": Stored(Trial),
     "Match": Stored(
         Match,
+        renamed={"witness": "ray_states"},
         shapes={
             "dot": "n",
             "ray": "n 2",
             "reflected": "n 2",
             "plane_mm": "n 2",
             "plane_covariance_mm2": "n 2 2",
-            "witness": "rows columns",
+            "ray_states": "rows columns",
         },
         fits=_match_fits,
     ),

@@ -59,7 +59,7 @@ def test_new_session_is_incomplete_and_drawn_with_defaults(
     assert shown.missing == set(needed)
     assert shown.problems == {}
     assert set(shown.values.values()) == {None}
-    assert shown.others == ("The imaging plane is not calibrated: that is step 3.",)
+    assert shown.others == ("The imaging plane is not calibrated: that is step Imaging plane.",)
     bench = presenter.bench(empty)
     assert bench.rig is not None
     assert bench.rig.laser.distance_mm == presenter.DEFAULTS["laser.distance_mm"]

@@ -70,7 +70,7 @@ def misfits(
     (directions, landing), (plane_mm, covariance), (laser, plane) = rays, seen, bench
     found = np.full(len(labelled), np.inf)
     none, no_level = np.empty(0), np.zeros(11)
-    witnesses = np.empty((0, 3)), np.empty(0, np.int64), none, np.ones(2)
+    known_rays = np.empty((0, 3)), np.empty(0, np.int64), none, np.ones(2)
     run_limits = np.array([*limits[6:10], np.nan, 1.0, 0.0, 1.0, 0.0, 0.0])
     for k in range(len(labelled)):
         row, column = np.nonzero(labelled[k] >= 0)
@@ -94,7 +94,7 @@ def misfits(
             grid,
             (stiffness, own, weights, laser, plane, dots),
             (zero, zero, points, stiffness),
-            (outer, *witnesses),
+            (outer, *known_rays),
             no_level,
             run_limits,
         )

@@ -24,7 +24,7 @@ STEPS_PER_REACH = 120
 each side."""
 
 NEAR_RISES = 3.0
-"""Witnesses whose rays land farther than this from the boundary, in spacings, are ignored."""
+"""Rays that land farther than this from the boundary, in spacings, are ignored."""
 
 RAYS_PER_LOG = 500
 """Rays after which the product is replaced by its logarithm: even twice as many factors of at most
@@ -70,7 +70,7 @@ def _accumulate(
     """
     count = len(factors)
     if min(start, start + (count - 1) * slope) > FARTHEST:
-        return  # nothing to add: most witnesses are far on the correct side
+        return  # nothing to add: most rays land far on the correct side
     turn = -start / slope if slope != 0.0 else np.inf * start
     turn = int(min(max(np.ceil(turn), 0.0), count)) if not np.isnan(turn) else 0
     begins, ends = (0, turn) if slope > 0.0 else (turn, count)
@@ -87,7 +87,7 @@ def _accumulate(
 
 
 @_inner
-def _add_witnesses(
+def _add_rays(
     sums: tuple[FloatArray, FloatArray, FloatArray],
     rays: IntArray,
     over: FloatArray,
@@ -115,7 +115,7 @@ def _add_witnesses(
 
 @_inner
 def _total(nats: FloatArray, factors: FloatArray, lines: FloatArray) -> FloatArray:
-    """Nats of each level from the sums of `_add_witnesses` for one drop."""
+    """Nats of each level from the sums of `_add_rays` for one drop."""
     total, start, slope = np.empty(len(nats)), 0.0, 0.0
     for k in range(len(nats)):
         start, slope = start + lines[0, k], slope + lines[1, k]
@@ -134,7 +134,7 @@ def level_negative_log_likelihood(
     levels: tuple[float, float, int],
     blurs: FloatArray,
 ) -> FloatArray:
-    """−log likelihood of lit and dark witnesses at levels.
+    """−log likelihood of lit and dark rays at levels.
 
     With x = signed_sharpness · (over + level) / √(blur² + spread), a lit ray has
     P = 1/(1 + exp(−x)), up to a factor common to all levels. A dark ray, of the opposite sign,
@@ -144,12 +144,12 @@ def level_negative_log_likelihood(
     Parameters
     ----------
     over
-        Height of the surface over the boundary where n witnesses land, for each of d drops of the
+        Height of the surface over the boundary where n rays land, for each of d drops of the
         rear, shape (d, n), mm.
     signed_sharpness
-        +1 or −1 of each witness, lit or dark, over its rise (`find_level`), shape (n,), mm⁻¹.
+        +1 or −1 of each ray, lit or dark, over its rise (`find_level`), shape (n,), mm⁻¹.
     dark
-        Which witnesses are dark, shape (n,).
+        Which rays are dark, shape (n,).
     spread
         Widens the blur where the height is uncertain (`spread_of`), in squared spacings of the
         rays, shape (n,).
@@ -178,12 +178,12 @@ def level_negative_log_likelihood(
         nats, factors = np.zeros((drops, count)), np.ones((drops, 2, count))
         lines = np.zeros((drops, 2, count + 1))
         common = nats[:1], factors[:1], lines[:1]
-        _add_witnesses(common, same, over[:1], sharp, dark, missing, levels)
+        _add_rays(common, same, over[:1], sharp, dark, missing, levels)
         if drops > 1:
             if _total(nats[0], factors[0], lines[0]).min() + blurs[1, b] > least + FARTHEST:
                 continue  # the other rays can only add to it
             nats[1:], factors[1:], lines[1:] = nats[0], factors[0], lines[0]
-        _add_witnesses((nats, factors, lines), others, over, sharp, dark, missing, levels)
+        _add_rays((nats, factors, lines), others, over, sharp, dark, missing, levels)
         for d in range(drops):
             made[d, b] = _total(nats[d], factors[d], lines[d])
             least = min(least, made[d, b].min() + blurs[1, b])
@@ -269,7 +269,7 @@ def rises_of(slope: FloatArray, spacing: FloatArray) -> tuple[FloatArray, float]
 def scan_levels(
     height: FloatArray,
     slope: FloatArray,
-    witness: IntArray,
+    ray_states: IntArray,
     spacing: FloatArray,
     count: int,
     blur: FloatArray,
@@ -284,7 +284,7 @@ def scan_levels(
     levels = first, (height[0].max() - height[0].min()) / (count - 1), count
     for way in (1, -1):
         nats = level_negative_log_likelihood(
-            over, way * witness / rises, witness < 0, exact, 0.0, levels, blur
+            over, way * ray_states / rises, ray_states < 0, exact, 0.0, levels, blur
         )[0, 0]
         at = np.argmin(nats)
         if nats[at] < least:
@@ -307,7 +307,7 @@ def search_level(
     height: FloatArray,
     slope: FloatArray,
     y: FloatArray,
-    witness: IntArray,
+    ray_states: IntArray,
     spacing: FloatArray,
     search: FloatArray,
     drops: FloatArray,
@@ -317,7 +317,7 @@ def search_level(
 
     Parameters
     ----------
-    height, slope, y, witness, spacing
+    height, slope, y, ray_states, spacing
         See `find_level`.
     search
         Sign of the head's side, the level in the middle, mm, its sign, how far levels reach from
@@ -337,7 +337,7 @@ def search_level(
     rises, usual = rises_of(slope, spacing)
     low, high = np.inf, -np.inf
     for n in range(len(y)):
-        if witness[n] > 0:
+        if ray_states[n] > 0:
             low, high = min(low, head_sign * y[n]), max(high, head_sign * y[n])
     start = (low + high) / 2.0
     end = min(low, start - 1e-6)  # a single row has no rear
@@ -349,7 +349,7 @@ def search_level(
     )
     for m in range(len(near)):
         at = near[m]
-        signed_sharpness[m], dark[m] = pool_sign * witness[at] / rises[at], witness[at] < 0
+        signed_sharpness[m], dark[m] = pool_sign * ray_states[at] / rises[at], ray_states[at] < 0
         spread[m] = spread_of(height[1, at], rises[at])
     over = np.empty((len(drops), len(near)))
     for m in range(len(near)):
@@ -375,7 +375,7 @@ def find_level(
     height: FloatArray,
     slope: FloatArray,
     y: FloatArray,
-    witness: IntArray,
+    ray_states: IntArray,
     spacing: FloatArray,
     head_and_drop: FloatArray,
     about: FloatArray,
@@ -383,7 +383,7 @@ def find_level(
 ) -> FloatArray:
     """Find the level at which lit rays land inside the boundary and dark ones outside.
 
-    A ray that lands a distance d inside the boundary came back with probability
+    A ray that lands a distance d inside the boundary was reflected with probability
     1/(1 + exp(−d/s)), and then has a dot unless that is missing. The posterior of level, blur s and
     drop of the rear is evaluated on a grid, which gives mean and standard deviation of the level.
     An uncertain height widens s for that ray.
@@ -392,10 +392,10 @@ def find_level(
     ----------
     height, slope
         Heights, up to the level, and their standard uncertainty, shape (2, m), mm, and gradients of
-        the surface, shape (m, 2), at the landing points of m witnesses on z = 0.
+        the surface, shape (m, 2), at the landing points of m rays on z = 0.
     y
         Y of the landing points, shape (m,), mm.
-    witness
+    ray_states
         +1 lit, −1 dark, shape (m,).
     spacing
         Distance between neighbouring landing points along X and along Y, shape (2,), mm.
@@ -407,7 +407,7 @@ def find_level(
         rises, the typical change of the height from one ray to the next. If the ends of the grid
         are likely, a wider one is searched. A reach of NaN: all levels are tried.
     missing
-        Probability that a ray that came back has no dot (`Match.missing`).
+        Probability that a reflected ray has no dot (`Match.missing`).
 
     Returns
     -------
@@ -420,14 +420,16 @@ def find_level(
     is_tried = False
     while True:
         if np.isnan(reach):
-            scanned, way = scan_levels(height, slope, witness, spacing, SCAN_LEVELS, BLURS[:, -1:])
+            scanned, way = scan_levels(
+                height, slope, ray_states, spacing, SCAN_LEVELS, BLURS[:, -1:]
+            )
             shift, pool_sign, reach, is_tried = scanned, float(way), SCANNED_REACH, True
         # Only pools above the work piece have been observed to sink at the rear.
         drops = np.array([0.0 if np.isnan(drop) else drop])
         if np.isnan(drop) and pool_sign > 0.0:
             drops = DROPS_MM.copy()
         search = np.array([head_sign, shift, pool_sign, reach, missing, SUNK_COST])
-        found, at_ends = search_level(height, slope, y, witness, spacing, search, drops, BLURS)
+        found, at_ends = search_level(height, slope, y, ray_states, spacing, search, drops, BLURS)
         is_wide = reach >= 1.0
         if (is_tried and is_wide) or not at_ends > (MOST_AT_FAR_ENDS if is_wide else MOST_AT_ENDS):
             return found
@@ -438,14 +440,14 @@ def find_level(
 def negative_log_evidence(
     height: FloatArray,
     slope: FloatArray,
-    witness: IntArray,
+    ray_states: IntArray,
     spacing: FloatArray,
     boundary_height: FloatArray,
     pool_sign: float,
     missing: float,
     blurs: FloatArray,
 ) -> float:
-    """−log probability of the witnesses, marginalised over levels near 0 and blurs, nats.
+    """−log probability of the states of rays, marginalised over levels near 0 and blurs, nats.
 
     ``boundary_height`` is that at the m landing points, shape (m,), mm. ``blurs`` is
     that of `search_level`, ``height`` is taken as exact, shape (m,), mm, and the others are those
@@ -458,7 +460,7 @@ def negative_log_evidence(
     for m in range(len(near)):
         at = near[m]
         over[0, m] = height[at] - boundary_height[at]
-        signed_sharpness[m], dark[m] = pool_sign * witness[at] / rises[at], witness[at] < 0
+        signed_sharpness[m], dark[m] = pool_sign * ray_states[at] / rises[at], ray_states[at] < 0
     exact = np.zeros(len(near))
     levels = -usual, usual / STEPS_PER_REACH, 2 * STEPS_PER_REACH + 1
     nats = level_negative_log_likelihood(

@@ -36,7 +36,7 @@ def _level_of_round(
     limits: FloatArray,
 ) -> FloatArray:
     """The level of a surface after a round, see `run_rounds`."""
-    outer, landing, witness, sigma, spacing = level_input
+    outer, landing, ray_states, sigma, spacing = level_input
     most, (head_sign, missing, drop_is_free, is_near) = limits[0], limits[5:9]
     if len(outer):
         shift, level_sigma, inner = guess_level(surface_at(grid, coefficients, points)[0], outer)
@@ -45,14 +45,14 @@ def _level_of_round(
     # The drop is fixed in the second half of the rounds, as the iteration may oscillate.
     is_held = drop_is_free == 0.0 or 2 * count > most
     there = surface_at(grid, coefficients, landing)
-    height = np.empty((2, len(witness)))
+    height = np.empty((2, len(ray_states)))
     height[0], height[1] = there[0], sigma
     reach = LEVEL_REACH if count else FIRST_REACH
     if level[8] > 0.0:
         reach = min(max(reach, REACH_SIGMAS * level[1] / level[8]), 1.0)
     about = np.array([0.0, level[2], reach if count or is_near != 0.0 else np.nan])
     head_and_drop = np.array([head_sign, level[3] if is_held else np.nan])
-    seen = height, there[1:].T, landing[:, 1], witness, spacing
+    seen = height, there[1:].T, landing[:, 1], ray_states, spacing
     found = find_level(*seen, head_and_drop, about, missing)
     if is_held:
         found[1], found[9:] = max(found[1], level[1]), level[9:]
@@ -84,8 +84,8 @@ def run_rounds(
     level_input
         Mask of the outer points from which the level is guessed, shape (n,), or empty; landing
         points, shape (m, 3), +1 or −1, shape (m,), and uncertainty of the height there, shape (m,),
-        of the witnesses, and the spacing of the rays, shape (2,) (`level.Witnesses`). With neither
-        an outer point nor a witness the surface is not shifted.
+        of the known rays, and the spacing of all, shape (2,) (`level.KnownRays`). With neither an
+        outer point nor a known ray the surface is not shifted.
     level
         Level before (`level_kernels.find_level`), shape (11,).
     limits

@@ -17,7 +17,7 @@ from labapp.core.values import FloatArray, IntArray
 
 _own = types.Tuple((FLOATS_1, FLOATS_2, FLOATS_2))  # type: ignore[no-untyped-call]
 _moved = types.Tuple((FLOATS_2, FLOATS_3, FLOATS_3, FLOATS_3))  # type: ignore[no-untyped-call]
-_witnesses = types.Tuple((FLOATS_2, INTS_1, FLOATS_1, FLOATS_1))  # type: ignore[no-untyped-call]
+_known_rays = types.Tuple((FLOATS_2, INTS_1, FLOATS_1, FLOATS_1))  # type: ignore[no-untyped-call]
 
 NEWTON_STEPS = 2
 """Newton steps from where the rays of a slightly perturbed bench pass at the height of the
@@ -78,12 +78,12 @@ def coefficient_changes(
     return changes
 
 
-@_compiled(FLOATS_2, FLOATS_1, FLOATS_2, _witnesses, FLOATS_3, FLOATS_1)
+@_compiled(FLOATS_2, FLOATS_1, FLOATS_2, _known_rays, FLOATS_3, FLOATS_1)
 def level_changes(
     grid: FloatArray,
     coefficients: FloatArray,
     changes: FloatArray,
-    witnesses: tuple[FloatArray, IntArray, FloatArray, FloatArray],
+    known_rays: tuple[FloatArray, IntArray, FloatArray, FloatArray],
     aside: FloatArray,
     search: FloatArray,
 ) -> FloatArray:
@@ -98,19 +98,19 @@ def level_changes(
         The surface.
     changes
         Changes of its coefficients (`coefficient_changes`), shape (q, p), mm.
-    witnesses
+    known_rays
         Landing points, shape (m, 3), +1 or −1, shape (m,), and uncertainty of the height there,
-        shape (m,), of the witnesses, and the spacing of the rays, shape (2,) (`level.Witnesses`).
+        shape (m,), of the known rays, and the spacing of all, shape (2,) (`level.KnownRays`).
     aside
         Displacements of the landing points on each bench, shape (q, m, 3), mm.
     search
         Side of the head, drop of the rear, sign of the pool, reach of the search in rises, and
         share of missing dots.
     """
-    landing, witness, sigma, spacing = witnesses
+    landing, ray_states, sigma, spacing = known_rays
     head_sign, drop, pool_sign, reach, missing = search
     head_and_drop, about = np.array([head_sign, drop]), np.array([0.0, pool_sign, reach])
-    height, levels = np.empty((2, len(witness))), np.empty(len(changes))
+    height, levels = np.empty((2, len(ray_states))), np.empty(len(changes))
     height[1] = sigma
     for k in range(len(changes)):
         shifts = np.empty(2)
@@ -119,7 +119,7 @@ def level_changes(
             places = landing + way * aside[k]
             there = surface_at(grid, coefficients + way * changes[k], places)
             height[0] = there[0]
-            seen = height, there[1:].T, places[:, 1], witness, spacing
+            seen = height, there[1:].T, places[:, 1], ray_states, spacing
             found = find_level(*seen, head_and_drop, about, missing)
             shifts[n] = found[0]
         levels[k] = (shifts[0] - shifts[1]) / 2.0

@@ -66,9 +66,10 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
     )),
     ("Laser", (
         Entry("laser.projection_angle_deg", "Projection angle", "°",
-              "Elevation of the beam above the work piece; step 2 measures it", 0, 90, 0.5, 2, 30),
+              "Elevation of the beam above the work piece; step Laser measures it",
+              0, 90, 0.5, 2, 30),
         Entry("laser.distance_mm", "Distance", "mm",
-              "From the diode to the work piece under the electrode; step 2 measures it",
+              "From the diode to the work piece under the electrode; step Laser measures it",
               0, 10_000, 0.5, 2, 35),
         Entry("laser.azimuth_deg", "Azimuth", "°",
               "How far the laser is turned out of the welding plane, anticlockwise from above; "
@@ -138,7 +139,7 @@ UNCERTAIN_ONLY = ("Image calibration", (
     Entry("camera_lens.distortion_percent_sigma", "Lens distortion", "%",
           "Of the picture in the plane's corner, of its distance from the middle", 0, 100, 0.1, 2),
 ))  # fmt: skip
-"""Fields for standard uncertainties only: the points are found in step 3."""
+"""Fields for standard uncertainties only: the points are found in step Imaging plane."""
 
 ASSUMED = {one.sigma_key: one.assumed for one in QUANTITIES}
 """Assumed standard uncertainties of quantities without an entry."""
@@ -257,7 +258,7 @@ def shown(session: Session) -> SetupState:
             rules = rules_for(problem.field, sections.get(problem.field))
             missing |= {f"{problem.field}.{key}" for key in rules if rules[key].required}
         elif problem.field.startswith("image_calibration") and is_missing:
-            others.append("The imaging plane is not calibrated: that is step 3.")
+            others.append("The imaging plane is not calibrated: that is step Imaging plane.")
         else:
             others.append(f"{problem.field}: {words}")
     unique = tuple(dict.fromkeys(others))

@@ -107,7 +107,7 @@ class SurfacePanel:
             for widget in (field, field.label):
                 widget.setVisible(not session.has_lines)
         dots = surface_state.state == "failed" and not session.has_lines
-        remedy = " Its dots can be corrected in step 6." if dots else ""
+        remedy = " Its dots can be corrected in step Dots." if dots else ""
         self.status.setText(f"{SIGNS[surface_state.state]} {surface_state.words}{remedy}")
         self._stale = surface_state.state == "stale"
         show_words(self.setup_words, surface_state.setup_words)

@@ -8,8 +8,8 @@ import pytest
 from labapp.config.setup import parse_setup
 from labapp.core.pipeline import Settings
 from labapp.media import Frame
-from labapp.run import measurers
-from labapp.run.measurers import LineFollower
+from labapp.run import line_measurer
+from labapp.run.line_measurer import LineMeasurer
 from tests.setups import FIVE_LINES
 
 ONE_LINE = FIVE_LINES.replace("count = 5", "count = 1")
@@ -19,7 +19,7 @@ AT_ONCE = 60
 
 @pytest.fixture(autouse=True)
 def few_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measurers, "FOLLOWED_AT_ONCE", AT_ONCE)
+    monkeypatch.setattr(line_measurer, "CLASSIFIED_AT_ONCE", AT_ONCE)
 
 
 def read(number: int) -> Frame:
@@ -33,7 +33,7 @@ def read(number: int) -> Frame:
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("over", [-30, 0, 1, 2, 45])
 def test_pulses_are_found_in_the_last_frames_too(first: int, over: int) -> None:
-    follower = LineFollower(read, parse_setup(ONE_LINE, "setup", lines=True), Settings())
+    follower = LineMeasurer(read, parse_setup(ONE_LINE, "setup", lines=True), Settings())
     numbers = range(first, first + AT_ONCE + over)
     results = list(follower(numbers))
     assert [result.frame for result in results] == list(numbers)
@@ -48,7 +48,7 @@ def test_frames_that_are_held_at_once_are_limited() -> None:
         reads.append(number)
         return read(number)
 
-    follower = LineFollower(counted, parse_setup(ONE_LINE, "setup", lines=True), Settings())
+    follower = LineMeasurer(counted, parse_setup(ONE_LINE, "setup", lines=True), Settings())
     results = follower(range(3 * AT_ONCE + 1))
     most = 0
     for done, _ in enumerate(results):
