@@ -179,7 +179,7 @@ def _beside_free_dots(observed: Observation, labels: IntArray) -> BoolArray:
     lit = labels != UNLABELLED
     dark = np.pad(amid(lit) & ~lit & ~observed.rays.absent, 1).astype(np.int64)
     adjacent = dark[:-2, 1:-1] + dark[2:, 1:-1] + dark[1:-1, :-2] + dark[1:-1, 2:]
-    beside = lit & (adjacent > 1)
+    beside: BoolArray = lit & (adjacent > 1)
     if beside.any():
         free = np.setdiff1d(np.arange(len(observed.plane_mm)), labels)
         dots = observed.plane_mm[labels[beside]]
