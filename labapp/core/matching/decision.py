@@ -36,6 +36,9 @@ from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
 from labapp.core.values import CannotMeasure, IntArray
 
+HIDDEN = 3
+"""The rows are ambiguous if so many of the four dots beside the absent one have no ray."""
+
 MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
 """Labels whose residuals exceed both the first, mm, and this multiple of the best residuals are
 discarded: residuals with wrong rays are usually ten times those with the correct ones."""
@@ -118,6 +121,7 @@ def decide(
             rivals.append((other.labels, _excess(other, cheapest)))
     best = _without(observed, best, doubtful, fit_settings)
     best = supported(observed, best, fit_settings)
+    _refuse_hidden_marker(observed, best.labels)
     freed = holes_left_open(observed, best, fit_settings, settings.margin)
     if freed:
         best = _without(observed, best, unconfirmed(freed[0], best.labels), fit_settings)
@@ -136,6 +140,23 @@ def _refuse_marker(observed: Observation, best: Hypothesis, found: list[Hypothes
     if best.marker == "unknown":
         raise CannotMeasure(
             "no-reference", "the absent centre dot is not between dots that have a ray"
+        )
+
+
+def _refuse_hidden_marker(observed: Observation, labels: IntArray) -> None:
+    """Raise ``ambiguous-rows`` if most dots beside the absent one and others have no ray.
+
+    Where rows cross there, any of several holes among their dots may be that of the absent one.
+    """
+    marker = observed.rig.pattern.marker
+    assert marker is not None
+    beside = np.pad(labels, 1, constant_values=UNLABELLED)[
+        marker[0] + np.array([-1, 1, 0, 0]), marker[1] + np.array([0, 0, -1, 1])
+    ]
+    free = len(observed.plane_mm) - np.count_nonzero(labels != UNLABELLED)
+    if np.count_nonzero(beside == UNLABELLED) >= HIDDEN and free > 1:
+        raise CannotMeasure(
+            "ambiguous-rows", "most dots beside the absent centre dot, and others, have no ray"
         )
 
 
