@@ -80,8 +80,7 @@ def test_slight_preference_of_knots_for_rows_does_not_decide(kind: str, seed: in
 @pytest.mark.parametrize(("kind", "seed"), [("dented", 9087), ("egg", 9100), ("lowrear", 9100)])
 def test_holes_ambiguous_within_setup_uncertainty_are_rejected(kind: str, seed: int) -> None:
     """With the setup assumed exact, every label was a row or a column off."""
-    rejected = {"ambiguous-rows", "no-match"}  # or none explains the dots
-    assert result_with_setup_errors(kind, seed).status in rejected
+    assert result_with_setup_errors(kind, seed).status == "ambiguous-rows"
 
 
 @pytest.mark.slow
@@ -258,13 +257,9 @@ def test_rows_ambiguous_because_of_a_second_hole_are_rejected(seed: int) -> None
 
 
 @pytest.mark.slow
-def test_boundary_identifies_the_marker_among_two_holes() -> None:
-    """With labels shifted by a row, reflected rays would lie outside the boundary.
-
-    A set-up off within its uncertainty could cause that: then the rows are ambiguous.
-    """
-    assert rendered.measured("dented", 45)[0].status == "ambiguous-rows"
-    got, _ = rendered.measured("dented", 45, is_exact=True)
+def test_second_hole_is_possible_within_the_setup_uncertainty_only() -> None:
+    assert rendered.measured("dented", 75)[0].status == "ambiguous-rows"
+    got, _ = rendered.measured("dented", 75, is_exact=True)
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.9 * got.shown
 

@@ -80,7 +80,7 @@ def test_rows_crossing_at_the_absent_dot_are_not_shifted(seed: int) -> None:
 
 
 def test_rows_are_ambiguous_if_dots_beside_the_absent_one_have_no_ray() -> None:
-    """Three of the four; a fifth dot had the ray of one of them."""
+    """Three of the four have none; a dot near them had the ray of one."""
     assert measure_pool(*draw(7397)).status == "ambiguous-rows"
 
 

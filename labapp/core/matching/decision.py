@@ -36,8 +36,9 @@ from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
 from labapp.core.values import CannotMeasure, IntArray
 
-HIDDEN = 3
-"""The rows are ambiguous if so many of the four dots beside the absent one have no ray."""
+HIDDEN, FREE, NEAREST = 3, 4, 6
+"""The rows are ambiguous if `HIDDEN` of the four dots beside the absent one have no ray, and `FREE`
+of the `NEAREST` dots to its computed place have none."""
 
 MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
 """Labels whose residuals exceed both the first, mm, and this multiple of the best residuals are
@@ -121,7 +122,7 @@ def decide(
             rivals.append((other.labels, _excess(other, cheapest)))
     best = _without(observed, best, doubtful, fit_settings)
     best = supported(observed, best, fit_settings)
-    _refuse_hidden_marker(observed, best.labels)
+    _refuse_hidden_marker(observed, best)
     freed = holes_left_open(observed, best, fit_settings, settings.margin)
     if freed:
         best = _without(observed, best, unconfirmed(freed[0], best.labels), fit_settings)
@@ -143,18 +144,22 @@ def _refuse_marker(observed: Observation, best: Hypothesis, found: list[Hypothes
         )
 
 
-def _refuse_hidden_marker(observed: Observation, labels: IntArray) -> None:
-    """Raise ``ambiguous-rows`` if most dots beside the absent one and others have no ray.
+def _refuse_hidden_marker(observed: Observation, best: Hypothesis) -> None:
+    """Raise ``ambiguous-rows`` if most dots beside the absent one, and others there, have no ray.
 
     Where rows cross there, any of several holes among their dots may be that of the absent one.
     """
     marker = observed.rig.pattern.marker
     assert marker is not None
-    beside = np.pad(labels, 1, constant_values=UNLABELLED)[
-        marker[0] + np.array([-1, 1, 0, 0]), marker[1] + np.array([0, 0, -1, 1])
+    at = np.array(marker) - 1
+    beside = np.pad(best.labels, 1, constant_values=UNLABELLED)[
+        at[0] + np.array([0, 2, 1, 1]), at[1] + np.array([1, 1, 0, 2])
     ]
-    free = len(observed.plane_mm) - np.count_nonzero(labels != UNLABELLED)
-    if np.count_nonzero(beside == UNLABELLED) >= HIDDEN and free > 1:
+    if np.count_nonzero(beside == UNLABELLED) < HIDDEN:
+        return
+    place = paths_of(observed, best.pool).plane_mm[np.ravel_multi_index(at, best.labels.shape)]
+    nearest = np.argsort(np.linalg.norm(observed.plane_mm - place, axis=-1))[:NEAREST]
+    if np.count_nonzero(~np.isin(nearest, best.labels)) >= FREE:
         raise CannotMeasure(
             "ambiguous-rows", "most dots beside the absent centre dot, and others, have no ray"
         )

@@ -29,13 +29,6 @@ from labapp.core.values import (
 MOST_STEPS = 1000
 """Largest number of steps that a grid grows from its seed."""
 
-NEARLY_ALL = 0.95
-"""A grid with a larger share of all dots is not merged with others, nor extended."""
-
-MOST, MOST_EXTENDED = 0.8, 3
-"""If the merged and extended grid has a smaller share of all dots, so many of the largest grids are
-extended instead."""
-
 LEAST_SHARED = 4
 """Grids are merged if they have at least this many dots in common, not all on one line, and agree
 on their rows and columns."""
@@ -43,13 +36,6 @@ on their rows and columns."""
 MOST_SLIP, MOST_SLANT = 0.55, 0.7
 """A row is misaligned by a column if the slant of its columns differs from that of other rows by at
 least the first, or is at least the second, in steps along the row: both slightly over a half."""
-
-MOST_UNSTEADY = 0.5
-"""Largest difference of a step from the median of those around it, in rows or in columns. A step to
-the wrong dot differs by 0.6 … 1; on strongly curved surfaces, the difference reaches 0.35."""
-
-EXTENSION = 8
-"""Number of rows and columns by which a grid is extended on each side at once."""
 
 NEAREST, NEAR = 10, 40
 """Numbers of nearest dots among which a dot's opposite neighbours, and a dot off their line, are
@@ -121,8 +107,11 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         tried[dot] = True
         if len(dot) >= settings.least:
             grown = _upright(_reduced(_grid_of(k, t, dot), dots_px), dots_px)
-            grids.append(_sound_part(grown, dots_px))
-    grid = _whole(grids, dots_px, settings) if grids else np.empty((0, 0), np.int64)
+            grids.append(_without_slips(grown, dots_px))
+    grid = max(grids, key=_count, default=np.empty((0, 0), np.int64))
+    if len(grids) > 1 and _count(grid) < settings.share * len(dots):
+        whole = _upright(_reduced(merge_grids(grids), dots_px), dots_px)
+        grid = max(grid, _without_slips(whole, dots_px), key=_count)
     if _count(grid) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
     grid = _grid_of(*_sites(grid))  # without empty margins
@@ -135,28 +124,6 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         reference=certain[0] if len(certain) == 1 else None,
         candidates=tuple(site for site, _ in holes),
     )
-
-
-def _whole(grids: list[IntArray], dots_px: ComplexArray, settings: GrowSettings) -> IntArray:
-    """The largest grid; merged with others and extended, unless it has nearly all dots."""
-    grids = sorted(grids, key=_count, reverse=True)
-    whole = grids[0]
-    if len(grids) > 1 and _count(whole) < NEARLY_ALL * len(dots_px):
-        whole = _larger(whole, merge_grids(grids), dots_px)
-    if _count(whole) < NEARLY_ALL * len(dots_px):
-        whole = _larger(whole, _extended(whole, dots_px, settings), dots_px)
-    for grid in grids[:MOST_EXTENDED]:
-        if _count(whole) < MOST * len(dots_px):
-            whole = _larger(whole, _extended(grid, dots_px, settings), dots_px)
-    return whole
-
-
-def _larger(grid: IntArray, other: IntArray, dots_px: ComplexArray) -> IntArray:
-    """The larger of a grid and the sound part of another, which has been put together."""
-    if _count(other) <= _count(grid):
-        return grid
-    other = _upright(_reduced(other, dots_px), dots_px)
-    return max(grid, _sound_part(other, dots_px), key=_count)
 
 
 def merge_grids(grids: list[IntArray]) -> IntArray:
@@ -331,30 +298,6 @@ def _upright(grid: IntArray, dots_px: ComplexArray) -> IntArray:
     if np.nansum(across.imag) < 0:
         grid = grid[::-1]
     return grid
-
-
-def _extended(grid: IntArray, dots_px: ComplexArray, settings: GrowSettings) -> IntArray:
-    """Add dots to a nearly regular grid that has stopped growing."""
-    from labapp.core.rows.lattice_kernels import extend
-
-    order = np.argsort(dots_px.real)
-    grid = np.where(grid >= 0, np.argsort(order)[grid], -1)
-    count = 0
-    while _count(grid) > count and max(grid.shape) < 2 * MOST_STEPS:
-        count = _count(grid)
-        grid = np.pad(grid, EXTENSION, constant_values=-1)
-        extend(dots_px[order], grid, settings.gate, settings.doubt)
-        grid = _grid_of(*_sites(grid))
-    return np.where(grid >= 0, order[grid], -1)
-
-
-def _sound_part(grid: IntArray, dots_px: ComplexArray) -> IntArray:
-    """Keep the largest part of a grid without misalignment, in whole rows and in single steps."""
-    from labapp.core.rows.lattice_kernels import sound_part
-
-    grid = _without_slips(grid, dots_px)
-    kept = sound_part(np.sort(dots_px), _places(grid, dots_px), MOST_UNSTEADY)
-    return np.where(kept, grid, -1)
 
 
 def _without_slips(grid: IntArray, dots_px: ComplexArray) -> IntArray:

@@ -32,36 +32,12 @@ MOST_OPEN = 0.6
 """Largest closure error of a valid cell, in sides: the difference between the two paths around it.
 After a misalignment by one column it is about 1."""
 
-AROUND = 3
-"""Steps are compared with the median of those from sites within this many rows and columns."""
-
-AT_CORNER = 0.15
-"""Dots within this share of a triangle's sides from a corner are at the corner."""
-
-FIT_REACH, LEAST_FITTED, MOST_ROUGH = 3, 8, 0.16
-"""A plane is fitted to the dots from sites within this many rows and columns of a site; least
-number of these dots; their largest standard deviation from the plane, in steps."""
-
 Claim = tuple[float, int, int, int]
 """Cost of a site's dot, from its distance to predictions; the site's row and column; the dot."""
 
 _f, _i, _c = types.float64, types.int64, types.complex128
 _dots = types.Array(_c, 1, "C", readonly=True)
 _sites = types.Array(_i, 2, "C")
-_places = types.Array(_c, 2, "C", readonly=True)
-
-
-@inner
-def _first_right_of(dots_px: ComplexArray, u: float) -> int:
-    """The first dot that is not left of u."""
-    start, end = 0, len(dots_px)
-    while start < end:
-        middle = (start + end) // 2
-        if dots_px[middle].real < u:
-            start = middle + 1
-        else:
-            end = middle
-    return start
 
 
 @inner
@@ -70,8 +46,15 @@ def _nearest(dots_px: ComplexArray, place: complex, within: float) -> tuple[int,
 
     Without a dot, its index is −1 and the distance infinite.
     """
+    start, end = 0, len(dots_px)
+    while start < end:
+        middle = (start + end) // 2
+        if dots_px[middle].real < place.real - within:
+            start = middle + 1
+        else:
+            end = middle
     nearest, least, second = -1, np.inf, np.inf
-    for dot in range(_first_right_of(dots_px, place.real - within), len(dots_px)):
+    for dot in range(start, len(dots_px)):
         off = dots_px[dot] - place
         if not off.real <= within:
             break
@@ -261,201 +244,3 @@ def grow(
         sites[at, 0], sites[at, 1], sites[at, 2], sites[at, 3] = k, t, dot, _root(parent, dot)
         dot_at[k, t] = -1
     return sites
-
-
-@inner
-def _insert(values: FloatArray, count: int, value: float) -> None:
-    """Insert a value into the first so many values, which are sorted."""
-    while count > 0 and values[count - 1] > value:
-        values[count] = values[count - 1]
-        count -= 1
-    values[count] = value
-
-
-@inner
-def _median_step(
-    places: ComplexArray, k: int, t: int, dk: int, dt: int, scratch: FloatArray
-) -> complex:
-    """Median step by (dk, dt) sites from the sites around one, each component; NaN if none."""
-    rows, columns = places.shape
-    count = 0
-    for i in range(max(k - AROUND, 0), min(k + AROUND + 1, rows - dk)):
-        for j in range(max(t - AROUND, 0), min(t + AROUND + 1, columns - dt)):
-            step = places[i + dk, j + dt] - places[i, j]
-            if not np.isnan(step.real):
-                _insert(scratch[0], count, step.real)
-                _insert(scratch[1], count, step.imag)
-                count += 1
-    if count == 0:
-        return complex(np.nan, np.nan)
-    low, high = (count - 1) // 2, count // 2
-    return complex(
-        (scratch[0, low] + scratch[0, high]) / 2, (scratch[1, low] + scratch[1, high]) / 2
-    )
-
-
-@inner
-def _steady_steps(places: ComplexArray, most: float) -> BoolArray:
-    """Whether the steps to the next row and to the next column are like those around them.
-
-    Shape (2, rows, columns); false where there is no step.
-    """
-    rows, columns = places.shape
-    steady, scratch = np.zeros((2, rows, columns), np.bool_), np.empty((2, (2 * AROUND + 1) ** 2))
-    for k in range(rows):
-        for t in range(columns):
-            if np.isnan(places[k, t].real):
-                continue
-            up = _median_step(places, k, t, 1, 0, scratch)
-            right = _median_step(places, k, t, 0, 1, scratch)
-            cell = most * abs((up.conjugate() * right).imag)
-            for way in range(2):
-                next_k, next_t = k + 1 - way, t + way
-                if next_k < rows and next_t < columns:
-                    off = places[next_k, next_t] - places[k, t] - (right if way else up)
-                    # In units of both steps, by Cramer's rule; false for NaN.
-                    steady[way, k, t] = (
-                        abs((off.conjugate() * right).imag) <= cell
-                        and abs((off.conjugate() * up).imag) <= cell
-                    )
-    return steady
-
-
-@inner
-def _empty(dots_px: ComplexArray, corner: complex, first: complex, second: complex) -> bool:
-    """Whether no dot is in or on the triangle of a corner and two steps, but at its corners."""
-    area = (first.conjugate() * second).imag
-    left = corner.real + min(0.0, first.real, second.real)
-    right = corner.real + max(0.0, first.real, second.real)
-    for dot in range(_first_right_of(dots_px, left), len(dots_px)):
-        if dots_px[dot].real > right:
-            break
-        off = dots_px[dot] - corner
-        a, b = (off.conjugate() * second).imag / area, (first.conjugate() * off).imag / area
-        c = 1.0 - a - b
-        if min(a, b, c) > -AT_CORNER and max(a, b, c) < 1.0 - AT_CORNER:
-            return False
-    return True
-
-
-@compiled(_dots, _places, _f)
-def sound_part(dots_px: ComplexArray, places: ComplexArray, most: float) -> BoolArray:
-    """Find the largest part of a grid that is connected by empty triangles of steady steps.
-
-    A row that skips another one has steps unlike those of other rows, or dots between them.
-
-    Parameters
-    ----------
-    dots_px
-        All dots, u − iv, shape (n,), px, sorted by u.
-    places
-        Position of each site's dot, px, NaN if there is none, shape (rows, columns).
-    most
-        Largest difference of a steady step from the median of those around it, in steps to the
-        next row and to the next column.
-
-    Returns
-    -------
-    BoolArray
-        Whether each site belongs to it, shape (rows, columns).
-    """
-    rows, columns = places.shape
-    steady, parent = _steady_steps(places, most), np.arange(rows * columns)
-    for k in range(rows):
-        for t in range(columns):
-            for dk in (1, -1):
-                for dt in (1, -1):
-                    if not (0 <= k + dk < rows and 0 <= t + dt < columns):
-                        continue
-                    if not (steady[0, min(k, k + dk), t] and steady[1, k, min(t, t + dt)]):
-                        continue
-                    here = places[k, t]
-                    if _empty(dots_px, here, places[k + dk, t] - here, places[k, t + dt] - here):
-                        root = _root(parent, k * columns + t)
-                        parent[_root(parent, (k + dk) * columns + t)] = root
-                        parent[_root(parent, k * columns + t + dt)] = root
-    part = np.full((rows, columns), -1)
-    count = np.zeros(rows * columns, np.int64)
-    for k in range(rows):
-        for t in range(columns):
-            if not np.isnan(places[k, t].real):
-                part[k, t] = _root(parent, k * columns + t)
-                count[part[k, t]] += 1
-    largest: BoolArray = part == count.argmax()
-    return largest
-
-
-@inner
-def _fitted_place(dots_px: ComplexArray, grid: IntArray, k: int, t: int) -> tuple[complex, float]:
-    """Position of a site by a fit that is linear in rows and columns, and the shortest step.
-
-    The step is 0 where there are too few dots, or they are too irregular.
-    """
-    count, mean_k, mean_t, mean = 0.0, 0.0, 0.0, 0.0 + 0.0j
-    kk, kt, tt, square, by_k, by_t = 0.0, 0.0, 0.0, 0.0, 0.0 + 0.0j, 0.0 + 0.0j
-    last_k, last_t = min(k + FIT_REACH + 1, grid.shape[0]), min(t + FIT_REACH + 1, grid.shape[1])
-    for i in range(max(k - FIT_REACH, 0), last_k):
-        for j in range(max(t - FIT_REACH, 0), last_t):
-            if grid[i, j] < 0:
-                continue
-            # Sums of squares and products about the means, updated dot by dot.
-            count += 1.0
-            off_k, off_t, off = i - k - mean_k, j - t - mean_t, dots_px[grid[i, j]] - mean
-            mean_k, mean_t, mean = (
-                mean_k + off_k / count,
-                mean_t + off_t / count,
-                mean + off / count,
-            )
-            share = (count - 1.0) / count
-            kk, kt, tt = kk + share * off_k**2, kt + share * off_k * off_t, tt + share * off_t**2
-            by_k, by_t = by_k + share * off_k * off, by_t + share * off_t * off
-            square += share * (off.real**2 + off.imag**2)
-    area = kk * tt - kt * kt
-    if count < LEAST_FITTED or area < 0.1 * kk * tt:
-        return 0.0 + 0.0j, 0.0
-    up, right = (tt * by_k - kt * by_t) / area, (kk * by_t - kt * by_k) / area
-    rest = square - (up.conjugate() * by_k + right.conjugate() * by_t).real
-    step = min(abs(up), abs(right), abs(up + right), abs(up - right))
-    if rest > (count - 3.0) * (MOST_ROUGH * step) ** 2:
-        return 0.0 + 0.0j, 0.0
-    return mean - mean_k * up - mean_t * right, step
-
-
-@compiled(_dots, _sites, _f, _f)
-def extend(dots_px: ComplexArray, grid: IntArray, gate: float, doubt: float) -> None:
-    """Add dots to a nearly regular grid, from the places that its dots around a site suggest.
-
-    Parameters
-    ----------
-    dots_px
-        The dots, u − iv, shape (n,), px, sorted by u.
-    grid
-        The dot at each site, −1 if there is none, shape (rows, columns); changed in place.
-    gate, doubt
-        As in `lattice_growth.GrowSettings`.
-    """
-    rows, columns = grid.shape
-    site_of = np.full(len(dots_px), -1)
-    for k in range(rows):
-        for t in range(columns):
-            if grid[k, t] >= 0:
-                site_of[grid[k, t]] = k * columns + t
-    added = True
-    while added:
-        added = False
-        claims = [(0, 0)][:0]
-        claimed = np.zeros(len(dots_px), np.int64)
-        for k in range(1, rows - 1):
-            for t in range(1, columns - 1):
-                if grid[k, t] >= 0 or grid[k - 1 : k + 2, t - 1 : t + 2].max() < 0:
-                    continue
-                place, step = _fitted_place(dots_px, grid, k, t)
-                dot, distance, second = _nearest(dots_px, place, doubt * gate * step)
-                certain = distance < gate * step and second >= doubt * distance
-                if dot >= 0 and certain and site_of[dot] < 0:
-                    claims.append((k * columns + t, dot))
-                    claimed[dot] += 1
-        for site, dot in claims:
-            if claimed[dot] == 1:
-                grid[site // columns, site % columns], site_of[dot] = dot, site
-                added = True
