@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.images import band_pass_kernels
 from labapp.core.match import missing_share
 from labapp.core.matching.observation import UNLABELLED, Observation, amid
 from labapp.core.matching.prediction import (
@@ -176,6 +175,8 @@ def _beside_free_dots(observed: Observation, labels: IntArray) -> BoolArray:
     beside them. Such a label has at least two adjacent rays without a dot, and two dots without a
     ray are nearer to it than any other labelled dot.
     """
+    from labapp.core.images import band_pass_kernels
+
     lit = labels != UNLABELLED
     dark = np.pad(amid(lit) & ~lit & ~observed.rays.absent, 1).astype(np.int64)
     adjacent = dark[:-2, 1:-1] + dark[2:, 1:-1] + dark[1:-1, :-2] + dark[1:-1, 2:]
