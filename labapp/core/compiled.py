@@ -235,7 +235,8 @@ def _one_at_a_time(function: Any) -> Iterator[None]:
 
     with FileLock(Path(place.get_cache_path()) / "lock"):
         yield
-        place.mark_of(function).touch()
+        with suppress(OSError):  # without a mark, the next process takes the lock, too
+            place.mark_of(function).touch()
 
 
 def _compile_cached(function: F, *signature: Any) -> F:

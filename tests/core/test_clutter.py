@@ -118,7 +118,7 @@ def test_rows_found_with_another_setup_must_be_clearer() -> None:
 @pytest.mark.parametrize(
     ("kind", "seed", "times", "status"),
     [
-        # The right rows cost more at first, and less when they are grown.
+        # The right rows cost more at first, and less when they are grown: refused as ambiguous.
         ("concave", 6902, 2.0, "ambiguous-rows"),
         ("concave", 6911, 2.0, "ambiguous-rows"),  # those of a hole three rows and columns away
         ("egg", 8207, 1.0, "ambiguous-rows"),  # a false dot at the absent ray makes them cost more

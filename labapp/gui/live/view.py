@@ -238,6 +238,7 @@ class LiveView(QObject):
         if basis != self._basis:
             self._basis = basis
             live.set_setup(setup_of(session), session.settings)
+            self._set_limits()  # measuring may have begun only now
             self.camera_fields.set_calibrated(calibrated_px(session))
             self._begin_figures(live)
 
@@ -331,7 +332,8 @@ class LiveView(QObject):
         session, watch = self.workspace.session, self._watch()
         if session is not None and watch is not None:
             watch.set_limits(session.limits)
-            self._show_figures(watch)
+            if self.live is not None and self.live.setup is not None:
+                self._show_figures(watch)
             self.canvas.show_status(watch)
 
     def _replan(self) -> None:

@@ -37,6 +37,7 @@ from labapp.media.cameras import (
     SimulatedDevice,
 )
 from labapp.media.recording.recorder import Plan
+from labapp.run.limits import Limits
 from labapp.run.live_measuring import LiveResult
 from labapp.session.session import Session
 from labapp.simulated.simulated_pool import camera_pool, pool_camera, simulated_pool
@@ -403,10 +404,13 @@ def test_figures_are_of_the_present_setup(
     start(page, qtbot)
     view, text = page.live_view, (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
     assert view.live.watch is None
+    limits = Limits(width_mm=(None, 99.0))
+    window.workspace.attempt(lambda session: session.set_limits(limits))
     heights = []
     for setup in (text, text.replace("distance_mm = 50.0", "distance_mm = 50.5")):
         window.workspace.attempt(partial(Session.set_setup, text=setup))
         assert view._result is None
+        assert view.live.watch.alarms.limits == limits
         qtbot.waitUntil(lambda: view._result is not None)
         heights.append(view._result.measurement.measures.height_mm)
     assert abs(heights[1] - heights[0]) > 1e-4
