@@ -223,9 +223,8 @@ class LiveView(QObject):
         self.penetration.setVisible(live.watch is not None)
         self.measured_s, self._result = 0.0, None
         self.figures.show_figures(figures(None) if is_measured else ())
-        self.figures.words.setText(
-            "" if is_measured or session is None else why_unmeasured(session)
-        )
+        why = "" if is_measured or session is None else why_unmeasured(session)
+        self.figures.words.setText(why)
         self.figures.setup_words.setText("")
         self.canvas.set_live(live.watch is not None)
 
@@ -234,8 +233,7 @@ class LiveView(QObject):
         session, live = self.workspace.session, self.live
         if session is None or live is None or not live.is_open:
             return
-        basis = session.setup_text, session.settings
-        if basis != self._basis:
+        if (basis := (session.setup_text, session.settings)) != self._basis:
             self._basis = basis
             live.set_setup(setup_of(session), session.settings)
             self._set_limits()  # measuring may have begun only now
