@@ -47,6 +47,7 @@ def work(path: Path, recording: Path, pipe: int) -> None:
 
     measure_each, import_recording = Session.measure_each, Session.import_recording
 
+    # Passed on unchanged, whatever they are.
     def measured(session, *args, **kwargs):  # type: ignore[no-untyped-def]
         for number, measurement in measure_each(session, *args, **kwargs):
             report(number)
@@ -59,6 +60,7 @@ def work(path: Path, recording: Path, pipe: int) -> None:
 
         return import_recording(session, *args, progress=step, **kwargs)
 
+    # The process to be killed reports what it does.
     Session.measure_each = measured  # type: ignore[method-assign]
     Session.import_recording = imported  # type: ignore[method-assign]
     app = start_app()

@@ -305,7 +305,7 @@ def test_changed_setup_replaces_the_results(watch: LiveWatch, events: Events, se
         prepare(watch, {3: 6.5})
         return Prepared.measure(former, given, drawn)
 
-    former.measure = replaced_meanwhile  # type: ignore[method-assign]
+    former.measure = replaced_meanwhile  # type: ignore[method-assign]  # in mid-measurement
     watch.measure(frame(2))
     assert watch.newest() is None
     assert watch.trend.over(60, Limits()).number.tolist() == []

@@ -389,9 +389,9 @@ def _rivals(
     labelled = [best.labels, *labelled]
     quick_mm = observed.quick_misfits(labelled, best.pool)
     far_mm = QUICK_MISFIT_TIMES * quick_mm[0]
-    rough = try_fit(observed, best.labels, initial=best.pool)
     dipped = fit_settings == FINE_FIT or best.residual_rms_mm > FOLLOWED_MM
-    costs = None if rough is None or dipped else rough_costs(observed, best.labels, rough)
+    rough = None if dipped else try_fit(observed, best.labels, initial=best.pool)
+    costs = None if rough is None else rough_costs(observed, best.labels, rough)
     rivals = []
     for labels, off_mm in zip(labelled[1:], quick_mm[1:], strict=True):
         pool = None if off_mm > far_mm else try_fit(observed, labels, initial=best.pool)
