@@ -90,6 +90,14 @@ def test_dot_keeps_its_ray_if_the_surface_excludes_a_neighbour() -> None:
     assert left_out(beside, labels) == []
 
 
+def test_label_between_two_free_dots_is_not_supported_unless_its_row_is_hidden() -> None:
+    observed, labels = scene()
+    dot, fewer = inner_dot(labels), labels.copy()
+    fewer[9, [10, 12]] = UNLABELLED
+    assert left_out(observed, fewer) == [dot]
+    assert left_out(replace(observed, hidden_rows=frozenset({10})), fewer) == []
+
+
 def test_wide_dot_beside_a_missing_one_may_be_both() -> None:
     observed, labels = scene()
     dot, size = inner_dot(labels), np.full(len(observed.plane_mm), 2.0)

@@ -159,7 +159,8 @@ def _refuse_hidden_marker(observed: Observation, best: Hypothesis) -> None:
         return
     place = paths_of(observed, best.pool).plane_mm[np.ravel_multi_index(at, best.labels.shape)]
     nearest = np.argsort(np.linalg.norm(observed.plane_mm - place, axis=-1))[:NEAREST]
-    if np.count_nonzero(~np.isin(nearest, best.labels)) >= FREE:
+    has_place = np.isfinite(place).all()
+    if not has_place or np.count_nonzero(~np.isin(nearest, best.labels)) >= FREE:
         raise CannotMeasure(
             "ambiguous-rows", "most dots beside the absent centre dot, and others, have no ray"
         )

@@ -178,7 +178,8 @@ def _beside_free_dots(observed: Observation, labels: IntArray) -> BoolArray:
     from labapp.core.images import band_pass_kernels
 
     lit = labels != UNLABELLED
-    dark = np.pad(amid(lit) & ~lit & ~observed.rays.absent, 1).astype(np.int64)
+    no_dot = observed.rays.absent | observed.hidden
+    dark = np.pad(amid(lit) & ~lit & ~no_dot, 1).astype(np.int64)
     adjacent = dark[:-2, 1:-1] + dark[2:, 1:-1] + dark[1:-1, :-2] + dark[1:-1, 2:]
     beside: BoolArray = lit & (adjacent > 1)
     if beside.any():
