@@ -65,7 +65,7 @@ class LiveMeasuring:
         try:
             return self._pool.submit(_measured, frame, with_scene).result()
         except (BrokenProcessPool, CancelledError, RuntimeError) as error:
-            raise LiveMeasuringEnded(str(error)) from error
+            raise LiveMeasuringEnded("the measuring process has ended") from error
 
     def close(self) -> None:
         """Terminate the process. May be called twice."""

@@ -7,6 +7,7 @@ its `LiveResult` passed to the sinks. The window polls the newest result and sur
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -17,11 +18,12 @@ from labapp.config.setup import Setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.export.frame_result import FrameResult
 from labapp.export.rendering.scene import Scene
+from labapp.log import NAME
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
 from labapp.run.alarms import Alarm, Alarms
 from labapp.run.limits import Limits
-from labapp.run.live_measuring import LiveMeasuring, LiveResult
+from labapp.run.live_measuring import LiveMeasuring, LiveMeasuringEnded, LiveResult
 from labapp.run.live_queue import FrameQueue
 from labapp.run.live_trend import LiveTrend
 from labapp.run.streams import Stream, stream_values
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 
 SILENT_S = 10.0
 """Time without a result that raises an alarm, s. Without tracking, a frame takes seconds."""
+
+REMEDY = "To measure again, stop the camera and start it"
 
 
 class LiveWatch:
@@ -61,6 +65,8 @@ class LiveWatch:
         self._name, self._scheme, self._on_event = name, settings.scheme, on_event
         self._bit_depth = bit_depth
         self._measuring: LiveMeasuring | None = LiveMeasuring(setup, settings, bit_depth)
+        self.stopped = ""
+        """Why frames are not measured any more, and what to do; empty while they are measured."""
         self.queue = FrameQueue()
         """Frames to be measured."""
         self._newest: deque[LiveResult] = deque(maxlen=1)
@@ -103,10 +109,7 @@ class LiveWatch:
     def measure(self, frame: CameraFrame) -> None:
         """Measure a frame and pass the result to all sinks, or skip it (`LiveMeasuring`).
 
-        Raises
-        ------
-        LiveMeasuringEnded
-            If the measuring process has ended.
+        After an error, which is reported, nothing is measured until the set-up changes.
         """
         with_scene, began_s = self._scene_is_due.is_set(), time.monotonic()
         measuring = self._measuring
@@ -114,17 +117,29 @@ class LiveWatch:
             return
         try:
             result = measuring.measure(frame, with_scene)
+            is_tracked = result is not None and result.track_lost is None
+            self.queue.done(is_tracked, time.monotonic() - began_s)
+            with self._handing_on:
+                if result is not None and measuring is self._measuring:
+                    for sink in self._sinks:
+                        sink(result)
         except Exception as error:
+            self._stop(measuring, error)
+
+    def _stop(self, measuring: LiveMeasuring, error: Exception) -> None:
+        """End the measuring because of an error, and report it."""
+        reason = str(error)
+        if not isinstance(error, LiveMeasuringEnded):
+            reason = f"a fault in the program: {error!r}; details are in the log"
+        words = f"Nothing is measured any more: {reason}. {REMEDY}"
+        with self._handing_on:
             if measuring is not self._measuring:
                 return  # the set-up was changed, or this was closed
-            self._raise_silence(f"Nothing is measured any more: {error}")
-            raise
-        is_tracked = result is not None and result.track_lost is None
-        self.queue.done(is_tracked, time.monotonic() - began_s)
-        with self._handing_on:
-            if result is not None and measuring is self._measuring:
-                for sink in self._sinks:
-                    sink(result)
+            self._measuring, self.stopped = None, words
+        logging.getLogger(NAME).error("live figures", exc_info=error)
+        measuring.close()
+        self._on_event(Event(self._name, "warning", words), None)
+        self._raise_silence(words)
 
     def _judge(self, result: LiveResult) -> None:
         """Raise alarms, or end them."""
@@ -156,12 +171,15 @@ class LiveWatch:
     def _raise_silence(self, words: str) -> None:
         for alarm in self.alarms.silence(words):
             self._on_event(self._changed(alarm), None)
-        self._publish(FrameResult(*self._last, Measurement("silent", words, self._scheme)))
+        self._publish_silence(words)
+
+    def _publish_silence(self, reason: str) -> None:
+        self._publish(FrameResult(*self._last, Measurement("silent", reason, self._scheme)))
 
     def _publish(self, result: FrameResult) -> None:
         values = stream_values(result, self.alarms.shown)
         predictor = self.predictor
-        if predictor is not None and isinstance(result, LiveResult):  # not from `_raise_silence`
+        if predictor is not None and isinstance(result, LiveResult):  # not from `_publish_silence`
             values = {**values, **predictor.values()}
         with self._turn:  # no stream may be closed during this
             for stream in self._streams.values():
@@ -199,23 +217,30 @@ class LiveWatch:
 
     # --- changes ------------------------------------------------------------------------------
 
-    def set_setup(self, setup: Setup | None, settings: Settings) -> None:
+    def set_setup(self, setup: Setup | None, settings: Settings | None) -> None:
         """Measure the next frames with another set-up or other settings; None: measure none.
 
-        Results of the former ones are discarded; recordings, alarms and streams continue.
+        Results of the former ones are discarded; recordings, alarms and streams continue. Streams
+        are sent that the sizes are unknown until the next result.
         """
-        made = None if setup is None else LiveMeasuring(setup, settings, self._bit_depth)
+        made = None
+        if setup is not None and settings is not None:
+            made = LiveMeasuring(setup, settings, self._bit_depth)
+            self._scheme = settings.scheme
+        words = "nothing is measured" if made is None else "frames are measured with the new ones"
+        words = f"set-up or settings changed: {words}"
         with self._handing_on:
             former, self._measuring = self._measuring, None if self._is_closed else made
-            self._scheme, self._measured_s = settings.scheme, time.monotonic()
+            self._measured_s, self.stopped = time.monotonic(), ""
             self._newest.clear()
             self._scene.clear()
             self.trend.clear()
+            self._publish_silence(words)
         for each in (former, made):
             if each is not None and each is not self._measuring:
-                each.close()
-        words = "nothing is measured" if setup is None else "frames are measured with the new ones"
-        self._on_event(Event(self._name, "note", f"set-up or settings changed: {words}"), None)
+                # The caller must not wait until the process has ended.
+                threading.Thread(target=each.close, name="measuring ends", daemon=True).start()
+        self._on_event(Event(self._name, "note", words), None)
 
     def set_limits(self, limits: Limits) -> None:
         """Replace the limits from the next frame on."""

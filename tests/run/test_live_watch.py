@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -31,10 +32,17 @@ from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
 from labapp.run import live_measuring, live_trend, live_watch
 from labapp.run.limits import Limits, Size, standing
-from labapp.run.live_measuring import JUDGED_S, SEARCH_AFTER_S, LiveChain, LiveMeasuring, LiveResult
-from labapp.run.live_watch import LiveWatch
+from labapp.run.live_measuring import (
+    JUDGED_S,
+    SEARCH_AFTER_S,
+    LiveChain,
+    LiveMeasuring,
+    LiveMeasuringEnded,
+    LiveResult,
+)
+from labapp.run.live_watch import REMEDY, LiveWatch
 from labapp.run.streams import LineStream
-from tests.waiting import PATIENCE_S, connect
+from tests.waiting import PATIENCE_S, connect, wait_until
 
 SAMPLE = Path(__file__).parents[2] / "sample_sessions" / "gtaw"
 
@@ -171,7 +179,9 @@ def test_missing_results_are_an_alarm_until_the_next_result(
     assert events[-1][0].words.startswith("alarm over: No frame has been measured")
 
 
-def test_failed_measuring_is_an_alarm_and_is_streamed(watch: LiveWatch, events: Events):
+def test_failed_measuring_is_an_alarm_and_is_streamed(
+    watch: LiveWatch, events: Events, setup: Setup
+):
     stream = LineStream()
     watch.set_stream("lines", stream)
     with connect(stream.port) as connection:
@@ -179,16 +189,75 @@ def test_failed_measuring_is_an_alarm_and_is_streamed(watch: LiveWatch, events: 
         lines.readline()
 
         def broken(*_: object) -> LiveResult:
-            raise OSError("the process was killed")
+            raise LiveMeasuringEnded("the process was killed")
 
         prepare(watch, {}).measure = broken  # type: ignore[method-assign]  # it breaks
-        with pytest.raises(OSError, match="killed"):
-            watch.measure(frame(7))
+        for number in (7, 8):
+            watch.measure(frame(number))
         line = json.loads(lines.readline())
-    assert line["status"] == "silent"
-    assert line["alarm"] == "silent"
-    assert line.get("width_mm") is None
-    assert "Nothing is measured any more: the process was killed" in events[0][0].words
+        assert line["status"] == "silent"
+        assert line["alarm"] == "silent"
+        assert line.get("width_mm") is None
+        assert [event.kind for event, _ in events] == ["warning", "warning"]  # once, and the alarm
+        for event, _ in events:
+            assert "Nothing is measured any more: the process was killed" in event.words
+            assert REMEDY in event.words
+        assert REMEDY in watch.stopped
+        # Another set-up begins the measuring anew.
+        watch.set_setup(setup, Settings())
+        assert watch.stopped == ""
+        watch.measure(frame(9))
+        found = [json.loads(lines.readline())["status"] for _ in range(2)]
+        assert found == ["silent", "ok"]
+    assert watch.newest() is not None
+
+
+def test_fault_in_a_sink_is_reported_and_lasts_until_the_next_setup(
+    watch: LiveWatch, events: Events, setup: Setup, monkeypatch: pytest.MonkeyPatch
+):
+    with monkeypatch.context() as patched:
+        patched.setattr(watch.alarms, "judge", lambda *_: 1 / 0)
+        watch.measure(frame(1))
+    assert "ZeroDivisionError" in watch.stopped
+    watch.set_setup(setup, Settings())
+    watch.measure(frame(2))
+    assert watch.newest() is not None
+
+
+def test_changed_setup_does_not_wait_for_the_former_process(
+    watch: LiveWatch, setup: Setup, monkeypatch: pytest.MonkeyPatch
+):
+    gate, ended = threading.Event(), threading.Event()
+
+    def close() -> None:
+        gate.wait(10.0)
+        ended.set()
+
+    prepare(watch, {}).close = close  # type: ignore[method-assign]  # ends slowly
+    watch.set_setup(setup, Settings())
+    assert not ended.is_set()
+    gate.set()
+    wait_until(ended.is_set)
+
+
+def test_streams_say_at_once_that_sizes_of_a_former_setup_do_not_hold(
+    watch: LiveWatch, setup: Setup
+):
+    stream = LineStream()
+    watch.set_stream("lines", stream)
+    with connect(stream.port) as connection:
+        lines = connection.makefile(encoding="utf-8")
+        lines.readline()
+        watch.measure(frame(1))
+        watch.set_setup(setup, Settings())
+        watch.set_setup(None, None)
+        watch.measure(frame(2))
+        watch.set_setup(setup, Settings())
+        watch.measure(frame(3))
+        values = [json.loads(lines.readline()) for _ in range(5)]
+    assert [each["status"] for each in values] == ["ok", *["silent"] * 3, "ok"]
+    assert [each["width_mm"] for each in values] == [6.7, None, None, None, 6.7]
+    assert watch.stream("lines") is stream
 
 
 def test_alarms_ended_by_new_limits_are_reported(watch: LiveWatch, events: Events):

@@ -60,9 +60,13 @@ class LiveCanvas(QWidget):
         return list(PARTS)[self.stack.currentIndex()]
 
     def set_live(self, live: bool) -> None:
-        """Offer all parts while a camera is measured, otherwise only the picture."""
+        """Offer all parts while a camera is measured, otherwise only the picture.
+
+        A surface of a former camera or set-up disappears.
+        """
         self.tabs.setVisible(live)
         if live:
+            self.surface.clear()
             self.trends.refresh()
             self.streams.begin()
         else:

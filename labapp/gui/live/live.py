@@ -14,25 +14,17 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from labapp.config.setup import Setup
-from labapp.core.images.band_pass import DetectorTuning, quick_dots
-from labapp.core.images.dots import Dots
-from labapp.core.images.exposure import Exposure, judge_exposure
-from labapp.core.images.find_dots import DotSettings, find_dots
-from labapp.core.pipeline import Measurement, Settings
-from labapp.core.quality import UNMEASURED, Quality, judge_quality
-from labapp.core.values import CannotMeasure, FloatArray
+from labapp.core.pipeline import Settings
+from labapp.core.values import FloatArray
 from labapp.errors import InputError
+from labapp.gui.live.live_dots import JudgedFrame, LiveDots
 from labapp.log import NAME
-from labapp.media import GreyImage
 from labapp.media.cameras import Camera, CameraFrame, CameraInfo, CameraSettings, Feed
 from labapp.media.events import Event
 from labapp.media.recording.recorder import Plan, Recorder
 from labapp.media.recording.take_files import Take
 from labapp.run.limits import Limits
-from labapp.run.live_measuring import LiveMeasuringEnded
 from labapp.run.live_queue import newest_of
 from labapp.run.live_trend import RATE_S
 from labapp.run.live_watch import LiveWatch
@@ -44,9 +36,6 @@ SIMULATED = "simulated"
 
 SHOW_S, LOOK_S = 0.025, 0.25
 """Minimum intervals of detecting dots in a frame and of assessing a frame."""
-
-LIGHT_S = 1.0
-"""Interval of estimating noise and size of the dots, which takes a seventh of a second."""
 
 IDLE_S = 0.005
 
@@ -73,16 +62,6 @@ def choices(found: list[CameraInfo]) -> list[tuple[str, str]]:
     """(id, text) of the available cameras: the connected ones and the simulated one."""
     named = [(info.id, f"{info.name} ({info.kind})") for info in found]
     return [*named, (SIMULATED, "Simulated camera")]
-
-
-@dataclass(frozen=True)
-class JudgedFrame:
-    """Results for a frame."""
-
-    dots_px: FloatArray | None
-    """(u, v) of its dots, shape (n, 2); None if they come with the shown frames."""
-    quality: Quality | Exposure
-    """Whether it can be measured; only how bright it is, where lines are filmed."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +108,7 @@ class Live:
         self._place, self._folder, self._wanted = place, place().parent, wanted
         self._settings, self._limits = settings, limits or Limits()
         self.setup = setup
-        self._dots = None if settings is None else settings.dots
+        self._dots = LiveDots(None if settings is None else settings.dots)
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._to_show: deque[CameraFrame] = deque(maxlen=1)
         self._to_judge: deque[CameraFrame] = deque(maxlen=1)
@@ -145,8 +124,6 @@ class Live:
         self._is_stale = False
         self._closing = threading.Event()
         self._turn = threading.Lock()
-        self._light: DetectorTuning | None = None
-        self._light_s = 0.0
         self._workers: list[threading.Thread] = []
 
     # --- begin and end ------------------------------------------------------------------------
@@ -169,13 +146,13 @@ class Live:
                 return
         feed.stop()
 
-    def set_setup(self, setup: Setup | None, settings: Settings) -> None:
-        """Measure the next frames with another set-up or other settings; None: measure none."""
+    def set_setup(self, setup: Setup | None, settings: Settings | None) -> None:
+        """Measure the next frames with another set-up or other settings; see `Live`."""
         with self._turn:
             if self.feed is None or self._closing.is_set():
                 return
             self.setup, self._settings = setup, settings
-            self._dots = settings.dots
+            self._dots.settings = None if settings is None else settings.dots
             if self.watch is None:
                 self._begin_measuring(self.feed)
             else:
@@ -277,17 +254,12 @@ class Live:
                 took_s = time.monotonic() - began_s
                 self._closing.wait(max(every_s - took_s, rest * took_s))
         except Exception as error:
-            if self._closing.is_set() and isinstance(error, LiveMeasuringEnded):
-                return
             logging.getLogger(NAME).exception("live %s", what)
             words = f"a fault in the program has ended its {what}: {error!r}"
             self._events.put(Event(self.name, "warning", words))
 
     def _find_quickly(self, frame: CameraFrame) -> None:
-        light, places = self._light, None
-        if self._dots is not None and light is not None and _fits(light, frame.image):
-            places = _places_px(_dots_in(frame.image, light, self._dots))
-        self._newest.append(LiveFrame(frame, places))
+        self._newest.append(LiveFrame(frame, self._dots.find_quickly(frame.image)))
 
     def _judge(self, frame: CameraFrame) -> None:
         self._frame_byte = frame.image.nbytes
@@ -296,19 +268,7 @@ class Live:
         except OSError:
             self.room_byte = None
         depth = None if self.feed is None else self.feed.bit_depth
-        if self._dots is None:
-            self._judged.append(JudgedFrame(None, judge_exposure(frame.image, None, depth)))
-            return
-        quick = self._dots.method == "band-pass"
-        now_s, known = time.monotonic(), self._light
-        if quick and (known is None or now_s > self._light_s or not _fits(known, frame.image)):
-            self._light = DetectorTuning.of(frame.image, self._dots.band_pass)
-            self._light_s = now_s + LIGHT_S
-        dots = _dots_in(frame.image, self._light, self._dots)
-        found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
-        quality = judge_quality(frame.image, found, depth, rays_of(self.setup))
-        places = None if quick else _places_px(dots)
-        self._judged.append(JudgedFrame(places, quality))
+        self._judged.append(self._dots.judge(frame.image, depth, rays_of(self.setup)))
 
     # --- to look at ---------------------------------------------------------------------------
 
@@ -448,35 +408,19 @@ class Live:
         return self.feed.apply(wanted) if self.feed is not None and self.is_open else None
 
 
-def _fits(light: DetectorTuning, image: GreyImage) -> bool:
-    return light.noise.shape == image.shape
-
-
-def _places_px(dots: Dots | None) -> FloatArray:
-    return np.zeros((0, 2)) if dots is None else dots.image_px
-
-
-def _dots_in(image: GreyImage, light: DetectorTuning | None, settings: DotSettings) -> Dots | None:
-    """Dots of a frame, found quickly if its light is known; None if there are none."""
-    try:
-        if light is not None:
-            return quick_dots(image, light, settings.band_pass)
-        return find_dots(image, settings)
-    except CannotMeasure:
-        return None
-
-
 def rays_of(setup: Setup | None) -> int | None:
     """Number of rays of the pattern; None if the set-up is incomplete."""
     return None if setup is None else setup.rig.pattern.rows * setup.rig.pattern.columns
 
 
-def setup_of(session: Session) -> Setup | None:
-    """The set-up of a session; None if it is incomplete or its pattern consists of lines."""
+def measured_with(session: Session) -> tuple[Setup | None, Settings | None]:
+    """Set-up and settings of a session for `Live`; both None if its pattern consists of lines."""
+    if session.has_lines:
+        return None, None
     try:
-        return None if session.has_lines else session.setup
+        return session.setup, session.settings
     except InputError:
-        return None
+        return None, session.settings
 
 
 def _lasting(seconds: float) -> str:

@@ -82,9 +82,10 @@ class LiveStreams(QWidget):
     # --- what is done -------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Start the selected streams after a camera has been started."""
+        """Start the selected streams of a camera that are not open yet."""
+        watch = self._watch()
         for kind, box in self.boxes.items():
-            if box.isChecked():
+            if box.isChecked() and watch is not None and watch.stream(kind) is None:
                 self._bring_about(kind)
 
     def _wanted(self, kind: str) -> tuple[LiveWatch | None, str, bool]:

@@ -8,10 +8,7 @@ from functools import partial
 
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 
-from labapp.core.images.exposure import Exposure
 from labapp.core.pipeline import Settings
-from labapp.core.quality import Quality
-from labapp.core.values import FloatArray
 from labapp.gui.live.camera_fields import CameraFields, calibrated_px
 from labapp.gui.live.canvas import LiveCanvas
 from labapp.gui.live.figures import (
@@ -22,12 +19,13 @@ from labapp.gui.live.figures import (
     pace_text,
     why_unmeasured,
 )
-from labapp.gui.live.live import SIMULATED, Live, choices, setup_of
+from labapp.gui.live.live import SIMULATED, Live, choices, measured_with
+from labapp.gui.live.live_picture import LivePicture
 from labapp.gui.live.penetration import LivePenetration
 from labapp.gui.live.plan_fields import PlanFields
 from labapp.gui.live.record_bar import RecordBar
 from labapp.gui.tasks import DONE, PROBLEM, Control, Task
-from labapp.gui.views.picture import PictureView, rings
+from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.exposure import ExposureBars
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
@@ -75,6 +73,8 @@ class LiveView(QObject):
         Choice and settings, for the panel.
     canvas
         The picture and the other views of the camera.
+    picture
+        Frames in the page's picture.
     bar
         Recording bar below the canvas; visible while live.
     live
@@ -94,7 +94,6 @@ class LiveView(QObject):
         self.live: Live | None = None
         self.updates = 0
         """Number of times that a live frame was shown, as a picture or as a surface."""
-        self._picture, self._exposure = picture, exposure
         self._ending: list[Live] = []
         self._pools: dict[str, SimulatedDevice] = {}
         self._opening: Task | None = None
@@ -105,9 +104,7 @@ class LiveView(QObject):
         """Set-up, as text, and settings of the measuring."""
         self._timer = QTimer(self, interval=TICK_MS)
         self._timer.timeout.connect(self._tick)
-        self._rings = rings()
-        self._rings.hide()
-        picture.add(self._rings)
+        self.picture = LivePicture(picture, exposure)
         self.canvas = LiveCanvas(workspace, picture, self._watch, self.acknowledge)
         self._make_group()
         self.bar = RecordBar(self.trigger, self.mark, self.stop)
@@ -153,13 +150,14 @@ class LiveView(QObject):
         name = dict(self._choices)[chosen]
         folder, stem = self.workspace.folder, session.path.stem
         self._basis = session.setup_text, session.settings
+        setup, settings = measured_with(session)
         live = Live(
             name,
             lambda: recording_path(folder, stem),
             self.plan_fields.plan(),
             CameraSettings(),
-            None if session.has_lines else session.settings,
-            setup_of(session),
+            settings,
+            setup,
             session.limits,
         )
         opener = self._opener(chosen, session)
@@ -207,10 +205,9 @@ class LiveView(QObject):
         self.camera_fields.show_camera(
             live.feed, None if session is None else calibrated_px(session)
         )
-        self._rings.setData([])
         self._begin_figures(live)
         self._follow_session()
-        self._rings.show()
+        self.picture.begin()
         self._timer.start(TICK_MS)
         self._show_state()
         # Here Space records, also as the key of the focused widget.
@@ -235,7 +232,7 @@ class LiveView(QObject):
             return
         if (basis := (session.setup_text, session.settings)) != self._basis:
             self._basis = basis
-            live.set_setup(setup_of(session), session.settings)
+            live.set_setup(*measured_with(session))
             self._set_limits()  # measuring may have begun only now
             self.camera_fields.set_calibrated(calibrated_px(session))
             self._begin_figures(live)
@@ -248,7 +245,7 @@ class LiveView(QObject):
         if self._opening is not None:
             self._opening.cancel()  # otherwise a simulated pool would still be rendered
         self._timer.stop()
-        self._rings.hide()
+        self.picture.end()
         if live.watch is not None:
             self.canvas.show_status(live.watch)  # shows the last alarms
         self.canvas.set_live(False)
@@ -279,7 +276,7 @@ class LiveView(QObject):
         self.canvas.set_live(False)
         self.canvas.alarms.clear()
         self._timer.stop()
-        self._rings.hide()
+        self.picture.end()
         self._show_state()
 
     # --- recording ----------------------------------------------------------------------------
@@ -350,19 +347,8 @@ class LiveView(QObject):
         live, began_s = self.live, time.perf_counter()
         if live is None:
             return
-        shown = live.newest()
-        if shown is not None and self._picture.isVisible():
-            self._picture.show_picture(shown.frame.image)
-            self._ring_dots(shown.dots_px)
-            self.updates += 1
-        looked = live.looked()
-        if looked is not None:
-            self._ring_dots(looked.dots_px)
-            if isinstance(looked.quality, Exposure):
-                self._exposure.show_lines(looked.quality)
-                self._exposure.show()
-            elif self._result is None or self._age_s > OLD_S:
-                self._show_quality(looked.quality)
+        is_measured = self._result is not None and self._age_s <= OLD_S
+        self.updates += self.picture.follow(live, is_measured)
         if live.watch is not None:
             self._follow(live.watch)
         if time.monotonic() - self._status_s > STATUS_S:
@@ -384,7 +370,7 @@ class LiveView(QObject):
             if was_old or former is None or former.measurement.status != result.measurement.status:
                 self._status_s = 0.0  # the text about the figures is cleared with them
             if self._age_s <= OLD_S:  # otherwise it does not describe the visible pool
-                self._show_quality(result.quality)
+                self.picture.show_quality(result.quality)
         self.updates += self.canvas.follow(result, watch)
 
     def _show_figures(self, watch: LiveWatch) -> None:
@@ -396,14 +382,6 @@ class LiveView(QObject):
         """Age of the figures, s."""
         result = self._result
         return 0.0 if result is None else time.monotonic() - result.arrived_s
-
-    def _show_quality(self, quality: Quality) -> None:
-        self._exposure.show_exposure(quality.exposure, quality.words, quality.grade == "good")
-        self._exposure.show()
-
-    def _ring_dots(self, dots_px: FloatArray | None) -> None:
-        if dots_px is not None:
-            self._rings.setData(pos=dots_px)
 
     def _report_events(self, live: Live) -> None:
         """Report events, and emit recordings that have ended."""
@@ -426,17 +404,17 @@ class LiveView(QObject):
             pace, skipped = live.watch.trend.pace(), live.watch.queue.skipped
             if live.setup is not None:
                 self._show_figures(live.watch)
-                self.figures.words.setText(
-                    pace_text(self._result, pace, live.rate_hz(), self._age_s, skipped)
-                )
+                words = pace_text(self._result, pace, live.rate_hz(), self._age_s, skipped)
+                stopped = live.watch.stopped
+                self.figures.words.setText(f"▲ {stopped}" if stopped else words)
                 checked = live.setup.check_date
                 self.figures.setup_words.setText(live_setup_words(self._result, checked))
             self.canvas.show_status(live.watch)
-        picture = self._picture.picture
-        if live.feed is not None and picture is not None:
+        frame_byte = self.picture.frame_byte
+        if live.feed is not None and frame_byte is not None:
             set_to = live.feed.settings
             rate_hz = set_to.rate_hz if set_to.trigger == "free" else None
-            self.plan_fields.show_cost(picture.nbytes, rate_hz or live.rate_hz())
+            self.plan_fields.show_cost(frame_byte, rate_hz or live.rate_hz())
         if self._shown != (live.running is not None):
             self._show_state()
 

@@ -37,6 +37,7 @@ from labapp.media.cameras import (
     SimulatedDevice,
 )
 from labapp.media.recording.recorder import Plan
+from labapp.run import live_watch
 from labapp.run.limits import Limits
 from labapp.run.live_measuring import LiveResult
 from labapp.session.session import Session
@@ -251,6 +252,28 @@ def test_frames_are_measured_if_the_setup_is_complete(live: Live):
         assert abs(value - float(truth[name])) < max(5 * sigma, 0.02 * value), row
 
 
+def test_measuring_begins_anew_after_its_process_was_killed(tmp_path: Path):
+    with open_source(SAMPLES / "gtaw" / "recording.avi") as video:
+        image = video.frame(0).image
+    setup = read_setup(SAMPLES / "gtaw" / "setup.toml")
+    live = Live("t", lambda: tmp_path / "a.nut", Plan(), CameraSettings(), Settings(), setup)
+    try:
+        live.open(SimulatedDevice("test", lambda _: image, rate_hz=4).open)
+        watch = live.watch
+        assert watch is not None
+        wait_until(lambda: watch.newest() is not None)
+        for process in watch._measuring._pool._processes.values():
+            process.kill()
+        wait_until(lambda: any(live_watch.REMEDY in event.words for event in live.events()))
+        assert live_watch.REMEDY in watch.stopped
+        watch.newest()
+        live.set_setup(setup, Settings())
+        assert not watch.stopped
+        wait_until(lambda: watch.newest() is not None)
+    finally:
+        live.close()
+
+
 def test_camera_choices():
     cameras = [CameraInfo("uvc:0", "Microscope", "USB video")]
     assert choices(cameras) == [
@@ -462,8 +485,21 @@ def test_lines_are_not_judged_as_dots(
     assert clipped.value() == 0
     assert contrast.isHidden()  # that of dots
     assert page.exposure.verdict.text() == f"○ {LINES_NOT_JUDGED}"
-    assert not len(view._rings.data)
+    assert not len(view.picture.rings.data)
     assert view.figures.words.text() == LINES
+    # Also after an edit, and when dots become lines.
+    dots = (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
+    for text in (f"{setup}\n# checked", dots, setup):
+        window.workspace.attempt(partial(Session.set_setup, text=text))
+        if text == dots:
+            qtbot.waitUntil(lambda: page.exposure.verdict.text() != f"○ {LINES_NOT_JUDGED}")
+            view.picture.rings.setData(pos=np.ones((1, 2)))  # in some pictures it finds none
+            continue
+        updates = view.updates
+        qtbot.waitUntil(lambda updates=updates: view.updates > updates + 20)
+        qtbot.waitUntil(lambda: page.exposure.verdict.text() == f"○ {LINES_NOT_JUDGED}")
+        qtbot.waitUntil(lambda: not len(view.picture.rings.data))
+        assert view.figures.words.text() == LINES
 
 
 @pytest.mark.slow

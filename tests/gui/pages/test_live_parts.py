@@ -47,7 +47,7 @@ from labapp.media.cameras import CameraFrame, SimulatedDevice
 from labapp.run import live_watch
 from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits
-from labapp.run.live_measuring import LiveResult
+from labapp.run.live_measuring import LiveMeasuringEnded, LiveResult
 from labapp.run.live_trend import LiveSizes, Pace
 from labapp.session.session import Session
 from labapp.text import SETUP_MARKS
@@ -398,6 +398,68 @@ def test_outdated_results_are_marked_as_unknown(
         Prepared.gate.set()
     qtbot.waitUntil(lambda: surface_view.view.scene is not None)
     qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ within limits")
+
+
+def change_setup(window: MainWindow, distance_mm: float) -> None:
+    text = (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
+    text = text.replace("distance_mm = 50.0", f"distance_mm = {distance_mm}")
+    window.workspace.attempt(lambda session: session.set_setup(text))
+
+
+def test_surface_of_a_former_setup_disappears_at_once(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    start(page, qtbot)
+    choose(page, "Surface")
+    surface_view = page.live_view.canvas.surface.view
+    qtbot.waitUntil(lambda: surface_view.scene is not None)
+    Prepared.gate.clear()
+    try:
+        change_setup(window, 50.5)
+        assert surface_view.scene is None
+    finally:
+        Prepared.gate.set()
+    qtbot.waitUntil(lambda: surface_view.scene is not None)
+
+
+def test_ended_measuring_is_shown_with_a_remedy(
+    window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    start(page, qtbot)
+    view = page.live_view
+
+    def killed(*_: object) -> LiveResult:
+        raise LiveMeasuringEnded("the measuring process has ended")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Prepared, "measure", killed)
+        qtbot.waitUntil(lambda: live_watch.REMEDY in view.figures.words.text())
+        assert "process has ended" in log_of(window)
+    change_setup(window, 50.5)
+    qtbot.waitUntil(lambda: view._result is not None)
+    qtbot.waitUntil(lambda: "frames/s measured" in view.figures.words.text())
+
+
+def test_control_software_stays_connected_when_the_setup_changes(
+    window: MainWindow, page: CapturePage, qtbot: QtBot, port: int
+):
+    hand, view = Hand(window), page.live_view
+    start(page, qtbot)
+    choose(page, "Control software")
+    hand.enter(view.canvas.streams.ports["lines"], str(port))
+    view.canvas.streams.boxes["lines"].click()
+    qtbot.waitUntil(lambda: view.live.watch.stream("lines") is not None)
+    stream = view.live.watch.stream("lines")
+    with connect(port) as connected, connected.makefile("rb") as file:
+        file.readline()
+        for distance_mm in (50.5, 51.0):
+            change_setup(window, distance_mm)
+            qtbot.waitUntil(lambda: view._result is not None)
+            qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+            assert view.live.watch.stream("lines") is stream
+            while json.loads(file.readline())["status"] != "silent":
+                pass  # of the former set-up
+            assert json.loads(file.readline())["status"] == "ok"
 
 
 def test_control_software_receives_results_while_live(
