@@ -228,6 +228,7 @@ class OpcuaStream:
         self._ua = ua
         self._newest: Values | None = None
         self._variables: dict[str, Any] = {}
+        self._unknown: dict[str, Any] = {}
         self._ended = False
         self.sent = 0
         self._loop = _Loop("labapp OPC UA stream")
@@ -269,7 +270,8 @@ class OpcuaStream:
         pool = await server.nodes.objects.add_object(space, "Pool")
         words = dict.fromkeys((*WORDS, *ALARMS, PENETRATION[2]), "")
         sizes = dict.fromkeys((*MEASURE_COLUMNS, *PENETRATION[:2]), math.nan)
-        for name, empty in {"frame": -1, "time_s": math.nan, **words, **sizes}.items():
+        self._unknown = {"frame": -1, "time_s": math.nan, **words, **sizes}
+        for name, empty in self._unknown.items():
             self._variables[name] = await pool.add_variable(space, name, empty)
         await server.start()
         return server
@@ -278,7 +280,8 @@ class OpcuaStream:
         while not self._ended or self._newest is not None:
             values, self._newest = self._newest, None
             try:
-                for name, value in (values or {}).items():
+                # What a frame lacks is unknown, and must not remain from a former one.
+                for name, value in ({**self._unknown, **values} if values else {}).items():
                     await self._variables[name].write_value(math.nan if value is None else value)
                 self.sent += values is not None and self.listeners > 0
             except Exception as error:  # one frame must not end the stream

@@ -25,7 +25,7 @@ from labapp.run import streams
 from labapp.run.alarms import Alarm
 from labapp.run.streams import LineStream, OpcuaStream, open_stream, stream_values
 from labapp.text import SIGMA_OF
-from tests.waiting import PATIENCE_S, connect
+from tests.waiting import PATIENCE_S, connect, wait_until
 
 DARK = Measurement("no-dots", "It is dark", "fit")
 
@@ -289,7 +289,7 @@ def test_opc_ua_clients_read_the_newest_frame(port: int, measured: Measurement) 
             for _ in range(1000):
                 values = {
                     name: await (await pool.get_child(f"{space}:{name}")).read_value()
-                    for name in expected
+                    for name in (*expected, *predicted)
                 }
                 if values["frame"] == 41:
                     assert stream.listeners == 1
@@ -298,11 +298,15 @@ def test_opc_ua_clients_read_the_newest_frame(port: int, measured: Measurement) 
             return values
 
     try:
-        stream.publish(stream_values(FrameResult(40, None, DARK)))
+        predicted = {"penetration_mm": 3.4, "penetration_model": "bench"}
+        stream.publish({**stream_values(FrameResult(40, None, DARK)), **predicted})
+        wait_until(lambda: stream._newest is None)
         stream.publish(expected)
         values = asyncio.run(read())
     finally:
         stream.close()
+    assert math.isnan(values["penetration_mm"])  # the frame before had it
+    assert values["penetration_model"] == ""
     for name, value in expected.items():
         if value is None:
             assert math.isnan(values[name])

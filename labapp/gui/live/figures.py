@@ -38,6 +38,7 @@ ACKNOWLEDGE_PX = 40
 Look = Literal["plain", "alarm", "old"]
 
 FIRST = "Measuring the first frame: this takes some seconds…"
+NO_FRAMES = "No frames arrive at present; measuring the first one takes some seconds"
 NO_SETUP = "Sizes are shown here once the set-up is complete"
 LINES = "Lines are not measured live: record them, and measure the recording"
 
@@ -121,7 +122,7 @@ def pace_text(
         Number of frames that were not measured because a newer one was waiting.
     """
     if result is None:
-        return FIRST
+        return FIRST if came_hz != 0 else NO_FRAMES
     parts = []
     found = result.measurement
     if found.measures is None:

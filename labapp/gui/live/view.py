@@ -407,8 +407,10 @@ class LiveView(QObject):
                 words = pace_text(self._result, pace, live.rate_hz(), self._age_s, skipped)
                 stopped = live.watch.stopped
                 self.figures.words.setText(f"▲ {stopped}" if stopped else words)
-                checked = live.setup.check_date
-                self.figures.setup_words.setText(live_setup_words(self._result, checked))
+                words = live_setup_words(self._result, live.setup.check_date)
+                # Frames of another size than that of the calibration matter more.
+                unlike = self.camera_fields.part_words.text()
+                self.figures.setup_words.setText(unlike or words)
             self.canvas.show_status(live.watch)
         frame_byte = self.picture.frame_byte
         if live.feed is not None and frame_byte is not None:

@@ -29,8 +29,10 @@ from labapp.export.penetration import write_model
 from labapp.export.rendering.scene import HEIGHT, Scene
 from labapp.gui.live import penetration as live_penetration
 from labapp.gui.live import view as live_view
+from labapp.gui.live.camera_fields import PART_WORDS
 from labapp.gui.live.figures import (
     FIRST,
+    NO_FRAMES,
     NO_SETUP,
     OLD_S,
     alarms_text,
@@ -95,6 +97,8 @@ def test_figures_show_their_verdict_and_unknown_if_not_measured():
 
 def test_pace_text_explains_missing_figures_and_the_rate():
     assert pace_text(None, Pace(0.0, 0, 0), 60.0, 0.0, 0) == FIRST
+    assert pace_text(None, Pace(0.0, 0, 0), None, 0.0, 0) == FIRST
+    assert pace_text(None, Pace(0.0, 0, 0), 0.0, 0.0, 0) == NO_FRAMES
     assert (
         pace_text(live_result(), Pace(38.0, 76, 0), 60.0, 0.04, 0)
         == "38.0 of 60.0 frames/s measured; 0.04 s old"
@@ -420,6 +424,15 @@ def test_surface_of_a_former_setup_disappears_at_once(
     finally:
         Prepared.gate.set()
     qtbot.waitUntil(lambda: surface_view.scene is not None)
+
+
+def test_frames_unlike_the_calibration_are_marked_beside_the_sizes(page: CapturePage, qtbot: QtBot):
+    start(page, qtbot)
+    view = page.live_view
+    view.camera_fields.fields["region"].edited.emit("0, 8, 64, 32")
+    qtbot.waitUntil(lambda: PART_WORDS in view.figures.setup_words.text())
+    view.camera_fields.whole_button.click()
+    qtbot.waitUntil(lambda: PART_WORDS not in view.figures.setup_words.text())
 
 
 def test_ended_measuring_is_shown_with_a_remedy(
