@@ -19,6 +19,7 @@ COMPILED = (
         for name in ("centroid", "band_pass", "dot_fit", "size")
     ),
     "labapp.core.rows.lattice_kernels",
+    "labapp.core.rows.jump_kernels",
     *(
         f"labapp.core.surface.kernels.{name}_kernels"
         for name in (

@@ -430,6 +430,7 @@ def load_all() -> None:
     import labapp.core.matching.match_kernels
     import labapp.core.recording.chain
     import labapp.core.recording.row_vote
+    import labapp.core.rows.jump_kernels
     import labapp.core.rows.lattice_kernels
     import labapp.core.surface.kernels.boundary_kernels
     import labapp.core.surface.kernels.fit_kernels

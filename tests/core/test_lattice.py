@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 
+from labapp.core.rows.jump_kernels import without_jumps
 from labapp.core.rows.lattice import Lattice
 from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice, merge_grids
 from labapp.core.rows.lattice_kernels import BORDER, grow
-from labapp.core.values import CannotMeasure, FloatArray, IntArray
+from labapp.core.values import CannotMeasure, ComplexArray, FloatArray, IntArray
 from labapp.simulation.pools import egg, ellipsoidal_cap, spherical_cap
 from tests.scenes import as_dots, see
 
@@ -54,6 +57,41 @@ def test_full_grid_is_indexed_from_the_lower_left(bow: float, fan: float, roll_d
     np.testing.assert_array_equal(np.stack([lattice.row, lattice.column], axis=-1), site)
 
 
+def tiles(seed: int, gap: float, missing: float) -> tuple[FloatArray, IntArray]:
+    """Draw positions (u, v) and sites of a grid in tiles, turned, sheared, bowed, in perspective.
+
+    Gaps between tiles are wider by ``gap`` steps. In half of the grids rows are staggered; sites
+    are then in whole steps along two sides of the triangles that the dots make.
+    """
+    rng = np.random.default_rng([seed, round(100 * gap), round(100 * missing)])
+    across, tile, staggered = rng.integers(16, 26), rng.integers(5, 9), rng.random() < 0.5
+    row, column = np.mgrid[0:across, 0:across].reshape(2, -1)
+    x = 20.0 * (column + gap * (column // tile) + staggered * (row % 2) / 2)
+    y = rng.uniform(14.0, 26.0) * (row + gap * (row // tile))
+    x, y = x - x.mean(), y - y.mean()
+    x = x + rng.uniform(-0.2, 0.2) * y
+    y = y + rng.uniform(-5e-4, 5e-4) * x**2
+    turn = np.radians(rng.uniform(-45.0, 45.0))
+    place = (x + 1j * y) * np.exp(1j * turn) / (1 + rng.uniform(-5e-4, 5e-4, 2) @ [x, y])
+    positions = 400 + np.stack([place.real, place.imag], axis=-1)
+    positions = positions + rng.normal(0.0, 0.3, positions.shape)
+    shown = rng.random(len(row)) >= missing
+    return positions[shown], np.stack([row, column - staggered * (row // 2)], axis=-1)[shown]
+
+
+def wrong_among(lattice: Lattice, true: IntArray) -> int:
+    """Count wrong indices, up to the shift and the choice of the two steps that suit most dots."""
+    indexed = lattice.row > 0
+    site = np.stack([lattice.row, lattice.column], axis=-1)[indexed]
+    turns = np.array(list(product((-1, 0, 1), repeat=4))).reshape(-1, 2, 2)
+    agreeing = [
+        np.unique(site - true[indexed] @ turn, axis=0, return_counts=True)[1].max()
+        for turn in turns
+        if abs(round(np.linalg.det(turn))) == 1
+    ]
+    return int(indexed.sum() - max(agreeing))
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_tiles_with_gaps_are_joined_to_one_grid(seed: int) -> None:
     """As from an infrared projector: rows staggered and bowed, gaps a quarter step wide."""
@@ -63,14 +101,67 @@ def test_tiles_with_gaps_are_joined_to_one_grid(seed: int) -> None:
     v = 14.5 * (row + 0.25 * (row // 8)) + 6e-4 * (u - 250) ** 2
     positions = np.stack([u, v], axis=-1) + rng.normal(0, 0.2, (len(u), 2))
     lattice = grow_lattice(as_dots(positions), GrowSettings())
-    indexed = lattice.row > 0
-    assert indexed.mean() > 0.95
-    # In whole steps along two sides of the triangles that staggered dots make.
-    true = np.stack([row, column - row // 2, np.ones_like(row)], axis=-1)[indexed]
-    site = np.stack([lattice.row, lattice.column], axis=-1)[indexed]
-    steps = np.rint(np.linalg.lstsq(true, site, rcond=None)[0])
-    assert abs(round(np.linalg.det(steps[:2]))) == 1
-    np.testing.assert_array_equal(true @ steps, site)
+    assert np.mean(lattice.row > 0) > 0.95
+    assert wrong_among(lattice, np.stack([row, column - row // 2], axis=-1)) == 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("gap", [0.15, 0.3, 0.45, 0.6])
+@pytest.mark.parametrize("missing", [0.0, 0.1])
+def test_no_row_is_skipped_at_gaps_between_tiles(seed: int, gap: float, missing: float) -> None:
+    positions, true = tiles(seed, gap, missing)
+    try:
+        lattice = grow_lattice(as_dots(positions), GrowSettings())
+    except CannotMeasure:
+        assert gap > 0.3
+        return
+    assert wrong_among(lattice, true) == 0
+    assert np.mean(lattice.row > 0) > (0.5 if gap > 0.3 or missing else 0.85)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("missing", [0.0, 0.1])
+def test_grid_without_tiles_is_indexed(seed: int, missing: float) -> None:
+    positions, true = tiles(seed, 0.0, missing)
+    lattice = grow_lattice(as_dots(positions), GrowSettings())
+    assert wrong_among(lattice, true) == 0
+    assert np.mean(lattice.row > 0) > (0.9 if missing else 0.99)
+
+
+def jumping(dots: bool) -> tuple[ComplexArray, ComplexArray]:
+    """Return all dots, sorted, and places of 8 × 6 sites, the last row two steps beyond the others.
+
+    With ``dots``, three dots of the row between are not among them.
+    """
+    u, v = np.meshgrid(10.0 * np.arange(6), 10.0 * np.arange(8))
+    places = u - 1j * v
+    places[7] -= 10j
+    between = places[7, ::2] + 10j if dots else np.empty(0)
+    return np.sort(np.append(places, between)), places
+
+
+def test_row_beyond_a_dark_one_is_kept_but_not_one_beyond_dots() -> None:
+    assert without_jumps(*jumping(dots=False)).all()
+    kept = without_jumps(*jumping(dots=True))
+    assert kept[:7].all()
+    assert not kept[7].any()
+
+
+def test_row_that_is_shifted_by_a_column_is_not_kept() -> None:
+    _, places = jumping(dots=False)
+    places[7] += 10j
+    places[7, :3] += 10.0
+    places[7, 3:] = np.nan
+    kept = without_jumps(np.sort(places[~np.isnan(places)]), places)
+    assert kept[:7].all()
+    assert not kept[7].any()
+
+
+def test_false_dot_between_two_others_is_no_jump() -> None:
+    _, places = jumping(dots=False)
+    places = places[:7]
+    for false in (places[0, 0] - 5j, places[3, 3] + 5.0):
+        assert without_jumps(np.sort(np.append(places, false)), places).all()
 
 
 def test_contradictory_grids_are_not_joined() -> None:

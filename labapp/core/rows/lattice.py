@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from labapp.core.images.dots import Dots
 from labapp.core.values import IntArray, ReadOnlyArrays
@@ -77,16 +76,14 @@ def find_holes(dot_at: dict[Site, int], dots: Dots) -> list[tuple[Site, int]]:
     """
     if not dot_at:
         return []
-    points = dots.image_px
-    tree = scipy.spatial.cKDTree(points)
+    points = dots.u_px + 1j * dots.v_px
     holes = []
-    for k, t in {(k + dk, t + dt) for k, t in dot_at for dk, dt in _NEXT} - dot_at.keys():
+    for k, t in [(k, t + 1) for k, t in dot_at if (k, t + 2) in dot_at]:
         lit = [(k + dk, t + dt) in dot_at for dk, dt in _NEXT]
-        if not (lit[0] and lit[1]) or sum(lit) < 3:
+        if (k, t) in dot_at or sum(lit) < 3:
             continue
         left, right = points[dot_at[k, t - 1]], points[dot_at[k, t + 1]]
-        nearest = tree.query((left + right) / 2)[0]
-        if nearest > HOLE_DISTANCE * np.linalg.norm(right - left):
+        if np.abs(points - (left + right) / 2).min() > HOLE_DISTANCE * abs(right - left):
             holes.append(((k, t), sum(lit)))
     return sorted(holes, key=lambda hole: (-hole[1], hole[0]))
 

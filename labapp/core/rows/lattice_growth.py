@@ -108,10 +108,12 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         if len(dot) >= settings.least:
             grown = _upright(_reduced(_grid_of(k, t, dot), dots_px), dots_px)
             grids.append(_without_slips(grown, dots_px))
-    grid = max(grids, key=_count, default=np.empty((0, 0), np.int64))
+    grid = _largest_without_jumps(grids, dots_px, in_order)
     if len(grids) > 1 and _count(grid) < settings.share * len(dots):
-        whole = _upright(_reduced(merge_grids(grids), dots_px), dots_px)
-        grid = max(grid, _without_slips(whole, dots_px), key=_count)
+        sound = [_without_jumps(grown, dots_px, in_order) for grown in grids]
+        whole = _upright(_reduced(merge_grids(sound), dots_px), dots_px)
+        whole = _without_jumps(_without_slips(whole, dots_px), dots_px, in_order)
+        grid = max(grid, whole, key=_count)
     if _count(grid) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
     grid = _grid_of(*_sites(grid))  # without empty margins
@@ -286,16 +288,13 @@ def _reduced(grid: IntArray, dots_px: ComplexArray) -> IntArray:
 def _upright(grid: IntArray, dots_px: ComplexArray) -> IntArray:
     """Orient the grid so that columns count from left to right and rows from the bottom up."""
     place = _places(grid, dots_px)
-    along, across = np.diff(place, axis=1), np.diff(place, axis=0)
-    level = [
-        np.nansum(np.abs(steps.real)) / max(np.nansum(np.abs(steps)), 1e-9)
-        for steps in (along, across)
-    ]
+    along, across = (steps[~np.isnan(steps)] for steps in (np.diff(place), np.diff(place, axis=0)))
+    level = [np.abs(steps.real).sum() / max(np.abs(steps).sum(), 1e-9) for steps in (along, across)]
     if level[0] < level[1]:
         grid, along, across = grid.T, across, along
-    if np.nansum(along.real) < 0:
+    if along.real.sum() < 0:
         grid = grid[:, ::-1]
-    if np.nansum(across.imag) < 0:
+    if across.imag.sum() < 0:
         grid = grid[::-1]
     return grid
 
@@ -318,6 +317,29 @@ def _without_slips(grid: IntArray, dots_px: ComplexArray) -> IntArray:
     part = np.cumsum(~sound)
     kept: BoolArray = part == np.bincount(part, (grid >= 0).sum(axis=1)).argmax()
     return grid[kept]
+
+
+def _largest_without_jumps(
+    grids: list[IntArray], dots_px: ComplexArray, in_order: ComplexArray
+) -> IntArray:
+    """Cut the largest grids (`_without_jumps`) until none of the others can be larger."""
+    largest = np.empty((0, 0), np.int64)
+    for grid in sorted(grids, key=_count, reverse=True):
+        if _count(grid) <= _count(largest):
+            break
+        largest = max(largest, _without_jumps(grid, dots_px, in_order), key=_count)
+    return largest
+
+
+def _without_jumps(grid: IntArray, dots_px: ComplexArray, in_order: ComplexArray) -> IntArray:
+    """Keep the largest part of a grid without steps to wrong dots.
+
+    ``in_order`` are the dots sorted by u. Other parts would have wrong rows or columns.
+    """
+    from labapp.core.rows.jump_kernels import without_jumps
+
+    kept = without_jumps(in_order, _places(grid, dots_px))
+    return grid if kept.all() else np.where(kept, grid, -1)
 
 
 def _steps_along(place: ComplexArray) -> ComplexArray:

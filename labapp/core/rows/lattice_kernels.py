@@ -41,20 +41,26 @@ _sites = types.Array(_i, 2, "C")
 
 
 @inner
+def first_right_of(dots_px: ComplexArray, u: float) -> int:
+    """The first dot that is not left of u."""
+    start, end = 0, len(dots_px)
+    while start < end:
+        middle = (start + end) // 2
+        if dots_px[middle].real < u:
+            start = middle + 1
+        else:
+            end = middle
+    return start
+
+
+@inner
 def _nearest(dots_px: ComplexArray, place: complex, within: float) -> tuple[int, float, float]:
     """The dot nearest to a place, its distance and that of the second nearest, within a radius.
 
     Without a dot, its index is −1 and the distance infinite.
     """
-    start, end = 0, len(dots_px)
-    while start < end:
-        middle = (start + end) // 2
-        if dots_px[middle].real < place.real - within:
-            start = middle + 1
-        else:
-            end = middle
     nearest, least, second = -1, np.inf, np.inf
-    for dot in range(start, len(dots_px)):
+    for dot in range(first_right_of(dots_px, place.real - within), len(dots_px)):
         off = dots_px[dot] - place
         if not off.real <= within:
             break
@@ -161,7 +167,7 @@ def _seed_claims(
 
 
 @inner
-def _root(parent: IntArray, dot: int) -> int:
+def root(parent: IntArray, dot: int) -> int:
     """The root of a dot's tree (union-find)."""
     while parent[dot] != dot:
         parent[dot] = parent[parent[dot]]
@@ -181,7 +187,7 @@ def _connected_parts(dots_px: ComplexArray, dot_at: IntArray, placed: list[Claim
         sides = min(max(abs(b - a), abs(d - c)), max(abs(c - a), abs(d - b)))
         if abs(a - b - c + d) < MOST_OPEN * sides:
             for corner in (right, up, across):
-                parent[_root(parent, corner)] = _root(parent, dot)
+                parent[root(parent, corner)] = root(parent, dot)
     return parent
 
 
@@ -241,6 +247,6 @@ def grow(
     parent = _connected_parts(dots_px, dot_at, placed)
     sites = np.empty((len(placed), 4), np.int64)
     for at, (_, k, t, dot) in enumerate(placed):
-        sites[at, 0], sites[at, 1], sites[at, 2], sites[at, 3] = k, t, dot, _root(parent, dot)
+        sites[at, 0], sites[at, 1], sites[at, 2], sites[at, 3] = k, t, dot, root(parent, dot)
         dot_at[k, t] = -1
     return sites
