@@ -35,6 +35,7 @@ from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import LowRear, Pool, egg, spherical_cap
+from tests.benchmarks.clutter import draw_pool
 from tests.levels import find_level
 from tests.scenes import OPEN_RIG
 
@@ -321,6 +322,31 @@ def test_rear_sinks_although_no_dark_ray_is_seen_there() -> None:
         assert not less[WITH_SIGMA.index("height_mm")]
 
 
+def test_rays_pass_a_low_boundary_farther_from_the_laser() -> None:
+    rays, laser = project_rays(OPEN_RIG.laser, OPEN_RIG.pattern), OPEN_RIG.laser.position_mm
+    landing = rays.landing_mm[9]
+    level = Level(0.0, 0.0, 1, Rear(0.05, 8.0, -3.0), 0.0)
+    slope = np.tile([0.05, 0.25], (len(landing), 1))
+    passed = landing
+    for _ in range(20):
+        depth = -level.rear.height(passed[:, 1])[:, None]
+        passed = landing + depth / laser[2] * (landing - laser)
+    over = passed[:, :2] @ slope[0] - passed[:, 2]
+    found = level.height_inside(landing[:, :2] @ slope[0], slope, landing, laser)
+    np.testing.assert_allclose(found, over, atol=5e-4)
+
+
+def test_lengths_of_pools_with_a_low_rear_are_as_uncertain_as_stated() -> None:
+    deviations = []
+    for seed in range(20):
+        rig, pool = draw_pool("lowrear", np.random.default_rng(seed))
+        match = exact_match(trace(pool, rig), rig)
+        fitted = fit.fit_surface(match, rig, FitSettings())
+        size = fit.bound_and_measure(match, fitted, rig, FitSettings())[1]
+        deviations.append((size.length_mm - pool.size.length_mm) / size.length_sigma_mm)
+    assert np.sqrt(np.mean(np.square(deviations))) < 2.2
+
+
 def test_held_drop_keeps_its_uncertainty(match: Match) -> None:
     rays, at, settings = (
         project_rays(OPEN_RIG.laser, OPEN_RIG.pattern),
@@ -331,7 +357,7 @@ def test_held_drop_keeps_its_uncertainty(match: Match) -> None:
     basis = basis_around(points[:, :2], rays, settings.knot_mm)
     seen = match.plane_mm, match.plane_covariance_mm2
     equations = normal_equations(basis, OPEN_RIG, points, *seen, settings)
-    known_rays = KnownRays.of(rays, 1, match.ray_states, basis, 0.0)
+    known_rays = KnownRays.of(OPEN_RIG, match.ray_states, basis, 0.0)
     held = replace(
         fitted(match).level, sigma_mm=0.02, drop_sigma_mm=0.03, drop_covariance_mm2=-3e-4
     )

@@ -12,6 +12,7 @@ from labapp.config.setup import parse_setup, read_setup, updated_setup
 from labapp.core.calibration.plane_calibration import calibrate_plane
 from labapp.core.geometry.perturbation import moved_dots, moved_rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
+from labapp.core.match import Match
 from labapp.core.schemes import fit
 from labapp.core.surface.boundary_trace import trace_boundary
 from labapp.core.surface.measures import SIZES, measure_surface
@@ -33,20 +34,20 @@ RIG, SETTINGS = SETUP.rig, FitSettings()
 MATCH = exact_match(trace(egg(6.6, 3.0, 3.9, 0.33), RIG), RIG)
 
 
-def changes(pool: FittedPool | None = None) -> FloatArray:
-    pool = pool or fit.fit_surface(MATCH, RIG, SETTINGS)
+def changes(pool: FittedPool | None = None, match: Match = MATCH) -> FloatArray:
+    pool = pool or fit.fit_surface(match, RIG, SETTINGS)
     basis, coefficients, points = pool.surface.basis, pool.surface.coefficients, pool.points_mm
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
     boundary, slope = trace_boundary(basis, coefficients, pool.level, center)
     gradient = sizes_and_gradients(basis, coefficients, pool.level, boundary, slope).gradient
-    return setup_changes(MATCH, RIG, SETTINGS, pool, gradient[:, :-1])
+    return setup_changes(match, RIG, SETTINGS, pool, gradient)
 
 
-def sizes_on(offset: FloatArray) -> FloatArray:
+def sizes_on(offset: FloatArray, seen: Match = MATCH) -> FloatArray:
     """Return the sizes from the same dots on a perturbed bench."""
     assert RIG.uncertainty is not None
-    dots = moved_dots(MATCH.plane_mm, RIG, RIG.uncertainty.axes, offset)
-    rig, match = moved_rig(RIG, offset), replace(MATCH, plane_mm=dots)
+    dots = moved_dots(seen.plane_mm, RIG, RIG.uncertainty.axes, offset)
+    rig, match = moved_rig(RIG, offset), replace(seen, plane_mm=dots)
     size = measure_surface(fit.reconstruct(match, rig, SETTINGS), match, rig)
     return np.array([getattr(size, name) for name in SIZES])
 
@@ -65,11 +66,22 @@ def sizes_on(offset: FloatArray) -> FloatArray:
     ],
 )
 def test_changes_agree_with_fits_on_perturbed_benches(key: str) -> None:
+    assert_changes_agree(key, MATCH)
+
+
+@pytest.mark.parametrize("key", ["laser.projection_angle_deg", "imaging_plane.h_mm"])
+def test_changes_include_a_rear_that_seems_lower(key: str) -> None:
+    """On one of the perturbed benches the rear seems to lie 0.1 mm below the work piece."""
+    assert_changes_agree(key, exact_match(trace(egg(7.0, 3.3, 4.0, 0.35), RIG), RIG))
+
+
+def assert_changes_agree(key: str, match: Match) -> None:
+    """Compare the changes with fits on benches on which a quantity is off by ±σ."""
     assert RIG.uncertainty is not None
     offset = np.zeros(len(RIG.uncertainty.sigma))
     offset[INDEX[key]] = RIG.uncertainty.sigma[INDEX[key]]
-    expected = (sizes_on(offset) - sizes_on(-offset)) / 2
-    computed = changes()
+    expected = (sizes_on(offset, match) - sizes_on(-offset, match)) / 2
+    computed = changes(match=match)
     total = np.sqrt(np.sum(computed**2, axis=1))
     error = np.abs(computed[:, INDEX[key]] - expected)
     # A level estimated from scratch may respond differently to such a step.

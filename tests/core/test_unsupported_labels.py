@@ -258,7 +258,7 @@ def test_reflection_far_outside_the_boundary_is_unlikely() -> None:
     def evidence(sign: int) -> float:
         ray_states = hypothesis.ray_states.copy()
         ray_states[tuple(dark[0])] = sign
-        rays = observed.rays, BENCH_RIG.head_sign, ray_states, surface.basis, 0.01
+        rays = BENCH_RIG, ray_states, surface.basis, 0.01
         level = pool.level
         return KnownRays.of(*rays).negative_log_evidence(surface.basis, surface.coefficients, level)
 

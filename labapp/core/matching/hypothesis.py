@@ -201,10 +201,10 @@ def grow_and_evaluate(
 def _outside(observed: Observation, hypothesis: Hypothesis) -> IntArray:
     """Labelled rays that land well outside the boundary of the fit."""
     at = np.argwhere(hypothesis.labels != UNLABELLED)
-    x, y = observed.rays.landing_mm[at[:, 0], at[:, 1], :2].T
-    height, slope = hypothesis.pool.surface.height_and_gradient(x, y)
-    level = hypothesis.pool.level
-    inward = level.pool_sign * (height - level.rear.height(y))
+    landing = observed.rays.landing_mm[at[:, 0], at[:, 1]]
+    height, slope = hypothesis.pool.surface.height_and_gradient(*landing[:, :2].T)
+    level, laser_mm = hypothesis.pool.level, observed.rig.laser.position_mm
+    inward = level.height_inside(height, slope, landing, laser_mm)
     far = inward < -BEYOND_SPACINGS * np.linalg.norm(slope * observed.rays.spacing_mm, axis=-1)
     return np.asarray(at[far])
 

@@ -205,17 +205,16 @@ def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> Floa
     inside = np.ones(lit.shape)
     at = np.argwhere(lit & ~match_kernels.between(lit))
     landing, coefficients = observed.rays.landing_mm[tuple(at.T)], fitted.paths.coefficients
-    height = spline_kernels.surface_at(fitted.basis.grid, coefficients, landing)[0]
-    outside = level.pool_sign * (height - level.rear.height(landing[:, 1])) < 0.0
+    height, *slope = spline_kernels.surface_at(fitted.basis.grid, coefficients, landing)
+    laser_mm = observed.rig.laser.position_mm
+    outside = level.height_inside(height, np.stack(slope, axis=-1), landing, laser_mm) < 0.0
     odds = np.ones(len(at))  # the surface may go up there for the dot alone
     for k in np.flatnonzero(outside):
         nats = []
         for sign in (1, -1):
             ray_states = known.ray_states.copy()
             ray_states[tuple(at[k])] = sign
-            known_rays = KnownRays.of(
-                observed.rays, observed.rig.head_sign, ray_states, fitted.basis, missing
-            )
+            known_rays = KnownRays.of(observed.rig, ray_states, fitted.basis, missing)
             nats.append(known_rays.negative_log_evidence(fitted.basis, coefficients, level))
         odds[k] = np.exp(min(nats[1] - nats[0], 0.0))
     inside[tuple(at.T)] = odds / (1 + odds)

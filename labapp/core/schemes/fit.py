@@ -151,7 +151,7 @@ def bound_and_measure(
     if former is not None:
         sigma_of_setup = former.sigma
     else:
-        sigma_of_setup = setup_sigma(setup_changes(match, rig, settings, pool, gradient))
+        sigma_of_setup = setup_sigma(setup_changes(match, rig, settings, pool, by_all))
     reconstruction = Reconstruction(
         scheme="fit",
         surface=pool.surface,

@@ -395,9 +395,7 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     if not (ray_states < 0).any():
         raise TrackLost("no visible ray is missing: the boundary is not seen")
     missing = missing_share(len(found.missed), len(fit.lit_rays))
-    known_rays = KnownRays.of(
-        observed.rays, observed.rig.head_sign, ray_states, prior.basis, missing
-    )
+    known_rays = KnownRays.of(observed.rig, ray_states, prior.basis, missing)
     sigma = fit.rounds.height_sigma_mm(known_rays.landing_mm)
     known_rays = replace(known_rays, height_sigma_mm=sigma)
     near = replace(prior.level, shift_mm=0.0, sigma_mm=prior.level_sigma_mm)

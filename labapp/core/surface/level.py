@@ -12,7 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from labapp.core.geometry.optics import ProjectedRays
+from labapp.core.geometry.optics import project_rays
+from labapp.core.geometry.rig import Rig
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
@@ -107,6 +108,26 @@ class Level:
         variance = (self.sigma_mm * by_shift) ** 2 + both + (self.drop_sigma_mm * by_drop) ** 2
         return np.sqrt(np.maximum(variance, 0.0))
 
+    def height_inside(
+        self, height_mm: FloatArray, slope: FloatArray, landing_mm: FloatArray, laser_mm: FloatArray
+    ) -> FloatArray:
+        """Height of the surface, on the pool's side, over the boundary where rays pass it.
+
+        It is above 0 for rays that land inside. A ray passes a boundary below the work piece
+        farther from the laser than it would land on z = 0.
+
+        Parameters
+        ----------
+        height_mm, slope
+            The surface and its gradient at the landing points, shapes (m,), mm, and (m, 2).
+        landing_mm, laser_mm
+            Landing points on z = 0, shape (m, 3), and position of the laser, shape (3,), mm.
+        """
+        boundary_mm = self.rear.height(landing_mm[:, 1])
+        per_depth = (landing_mm - laser_mm)[:, :2] / laser_mm[2]
+        there = height_mm - boundary_mm * np.sum(slope * per_depth, axis=-1)
+        return np.asarray(self.pool_sign * (there - boundary_mm))
+
     @property
     def disagreement_bits(self) -> float:
         """Mean −log₂ likelihood of the rays near the boundary; infinite if there are none."""
@@ -127,8 +148,9 @@ class KnownRays(ReadOnlyArrays):
         +1 lit, −1 dark, shape (m,).
     spacing_mm
         Distance between neighbouring landing points along X and along Y, shape (2,), mm.
-    head_sign
-        +1 where the pool's head lies towards +Y, −1 for the reverse (`Rig.head_sign`).
+    head_sign, laser_mm
+        +1 where the pool's head lies towards +Y, −1 for the reverse (`Rig.head_sign`); position of
+        the laser, shape (3,), mm.
     missing
         Probability that a reflected ray has no dot (`Match.missing`).
     height_sigma_mm
@@ -140,24 +162,19 @@ class KnownRays(ReadOnlyArrays):
     ray_states: IntArray
     spacing_mm: FloatArray
     head_sign: int
+    laser_mm: FloatArray
     missing: float = 0.0
     height_sigma_mm: FloatArray | None = None
 
     @classmethod
-    def of(
-        cls,
-        rays: ProjectedRays,
-        head_sign: int,
-        ray_states: IntArray,
-        basis: SplineBasis,
-        missing: float,
-    ) -> KnownRays:
-        """Select the known ones of rays, shape (rows, columns), within the spline domain."""
-        landing = rays.landing_mm
-        if not ray_states.any():
-            return cls(landing[0, :0], ray_states[0, :0], rays.spacing_mm, head_sign, missing)
-        known = (ray_states != 0) & basis.contains(landing[..., 0], landing[..., 1])
-        return cls(landing[known], ray_states[known], rays.spacing_mm, head_sign, missing)
+    def of(cls, rig: Rig, ray_states: IntArray, basis: SplineBasis, missing: float) -> KnownRays:
+        """Select the known ones of a rig's rays, shape (rows, columns), in the spline domain."""
+        rays = project_rays(rig.laser, rig.pattern)
+        landing, known = rays.landing_mm, ray_states != 0
+        if known.any():
+            known &= basis.contains(landing[..., 0], landing[..., 1])
+        bench = rays.spacing_mm, rig.head_sign, rig.laser.position_mm
+        return cls(landing[known], ray_states[known], *bench, missing)
 
     def negative_log_evidence(
         self, basis: SplineBasis, coefficients: FloatArray, level: Level
@@ -169,13 +186,14 @@ class KnownRays(ReadOnlyArrays):
         from labapp.core.surface.kernels import level_kernels, spline_kernels
 
         there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
+        slope = there[1:].T
+        inside = level.height_inside(there[0], slope, self.landing_mm, self.laser_mm)
         return level_kernels.negative_log_evidence(
             there[0],
-            there[1:].T,
+            slope,
             self.ray_states,
             self.spacing_mm,
-            level.rear.height(self.landing_mm[:, 1]),
-            level.pool_sign,
+            inside,
             self.missing,
             level_kernels.BLURS,
         )
@@ -225,5 +243,7 @@ class LevelSearch:
         return level_input, level.as_array, limits
 
 
-NO_SEARCH = LevelSearch(KnownRays(np.empty((0, 3)), np.empty(0, np.int64), np.ones(2), 1))
+NO_SEARCH = LevelSearch(
+    KnownRays(np.empty((0, 3)), np.empty(0, np.int64), np.ones(2), 1, np.ones(3))
+)
 """The mean height of the reflection points stays."""

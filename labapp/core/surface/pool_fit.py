@@ -178,7 +178,7 @@ def fit_pool(
             initial.basis.grid, initial.coefficients, directions, points, NEWTON_STEPS
         )
     rounds = Rounds(equations, directions, np.zeros(basis.count), points, np.inf)
-    known_rays = KnownRays.of(rays, rig.head_sign, match.ray_states, basis, match.missing)
+    known_rays = KnownRays.of(rig, match.ray_states, basis, match.missing)
     outer = None if (known_rays.ray_states < 0).any() else is_outer
     most, until_mm = settings.rounds, settings.settled_mm
     level = rounds.run(most, until_mm, search=LevelSearch(known_rays, outer=outer))

@@ -4,8 +4,9 @@ The bench is perturbed by each column of a square root of its covariance, with t
 known rays of the fit. A column is the standard uncertainty of a quantity or, if quantities are
 correlated, one of the independent error components. The surface responds linearly: its coefficients
 solve the normal equations, so that their change follows from that of the right-hand side (implicit
-differentiation). The level depends on few rays and responds in steps: it is determined again with
-the bench perturbed by plus and minus one standard uncertainty, and half the difference is used.
+differentiation). The level and the drop of the rear depend on few rays and respond in steps: they
+are determined again with the bench perturbed by plus and minus one standard uncertainty, and half
+the difference is used.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ def setup_changes(
     pool
         Result of the fit, with p splines.
     gradient
-        Derivatives of m sizes by the spline coefficients, shape (m, p).
+        Derivatives of m sizes by the spline coefficients and by the drop of the rear, shape
+        (m, p + 1).
 
     Returns
     -------
@@ -72,15 +74,15 @@ def setup_changes(
     moved = [
         project_rays(bench.laser, bench.pattern).landing_mm[seen] - landing for bench, _ in benches
     ]
-    raised = setup_kernels.level_changes(
+    raised, dropped = setup_kernels.level_changes(
         basis.grid,
         pool.surface.coefficients,
         change,
         (landing, match.ray_states[seen], sigma, own.spacing_mm),
         np.reshape(moved, (-1, *landing.shape)) / SHARE,
-        np.array([rig.head_sign, level.rear.drop_mm, level.pool_sign, REACH, match.missing]),
-    )
-    changes[:, columns] = gradient @ (change + raised[:, None]).T
+        np.array([rig.head_sign, *rig.laser.position_mm, level.pool_sign, REACH, match.missing]),
+    ).T
+    changes[:, columns] = gradient @ np.column_stack([change + raised[:, None], dropped]).T
     return changes
 
 

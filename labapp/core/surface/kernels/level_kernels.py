@@ -43,11 +43,22 @@ narrow grid (reach below 1), the second for a wide one."""
 BLUR_WIDTHS = np.geomspace(1 / 200, 1 / 4, 9)
 BLURS = np.array([BLUR_WIDTHS, 1.2 * np.log(BLUR_WIDTHS)])
 
-# Drops: depths of the rear, mm. One rear in five lies below the work piece; its depths are equally
-# likely.
-DROPS_MM = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
-SHARE_SUNK = 0.2
-SUNK_COST = -float(np.log(SHARE_SUNK / (1 - SHARE_SUNK) / (len(DROPS_MM) - 1)))  # nats
+# Drops: depths of the rear, mm. Half of all rears lie below the work piece; the logarithms of their
+# depths are equally likely.
+DROPS_MM = np.concatenate([[0.0], np.geomspace(0.005, 0.15, 12)])
+SHARE_SUNK = 0.5
+
+
+def sunk_cost(drops_mm: FloatArray) -> float:
+    """−log of the prior of every drop but the first, which is none, over that of none, nats."""
+    return -float(np.log(SHARE_SUNK / (1 - SHARE_SUNK) / (len(drops_mm) - 1)))
+
+
+SUNK_COST = sunk_cost(DROPS_MM)
+
+LIKELY_SUNK = 0.8
+"""The rear is on the work piece unless it is below with a larger probability than this. Otherwise
+the surface would be extrapolated to a depth that hardly any ray shows."""
 
 
 @_inner
@@ -215,7 +226,7 @@ def level_posterior(
     Returns
     -------
     mean, sigma, drop, drop_sigma, covariance, at_ends
-        Expected level and drop, given that there is a drop or none, whichever is likelier, and
+        Expected level and drop, given that there is a drop or none (`LIKELY_SUNK`), and
         their standard deviations over both, mm; their covariance, mm²; probability of the first and
         last levels together.
     """
@@ -233,7 +244,7 @@ def level_posterior(
                 if against < least + FARTHEST:
                     share[d, k] += np.exp(least - against)
     share /= share.sum()
-    start, end = (1, depths) if share[0].sum() < 0.5 else (0, 1)
+    start, end = (1, depths) if share[0].sum() < 1.0 - LIKELY_SUNK else (0, 1)
     chosen, drop, mean = share[start:end].sum(), 0.0, 0.0
     for d in range(start, end):
         for k in range(count):
@@ -302,11 +313,11 @@ def spread_of(sigma: float, rise: float) -> float:
     return np.pi / 8.0 * (sigma / rise) ** 2
 
 
-@_compiled(FLOATS_2, FLOATS_2, FLOATS_1, INTS_1, FLOATS_1, FLOATS_1, FLOATS_1, FLOATS_2)
+@_compiled(FLOATS_2, FLOATS_2, FLOATS_2, INTS_1, FLOATS_1, FLOATS_1, FLOATS_1, FLOATS_2)
 def search_level(
     height: FloatArray,
     slope: FloatArray,
-    y: FloatArray,
+    landing: FloatArray,
     ray_states: IntArray,
     spacing: FloatArray,
     search: FloatArray,
@@ -317,12 +328,12 @@ def search_level(
 
     Parameters
     ----------
-    height, slope, y, ray_states, spacing
+    height, slope, landing, ray_states, spacing
         See `find_level`.
     search
-        Sign of the head's side, the level in the middle, mm, its sign, how far levels reach from
-        there, in rises, the probability that a dot is missing, and −log of the prior of every drop
-        but the first, nats.
+        Sign of the head's side, position of the laser, mm, the level in the middle, mm, its sign,
+        how far levels reach from there, in rises, the probability that a dot is missing, and −log
+        of the prior of every drop but the first, nats.
     drops
         Drops of the rear, mm.
     blurs
@@ -333,12 +344,12 @@ def search_level(
     found, at_ends
         The level (`find_level`), shape (11,), and its probability at the ends of the grid.
     """
-    head_sign, shift, pool_sign, reach, missing, sunk = search
+    head_sign, laser, (shift, pool_sign, reach, missing, sunk) = search[0], search[1:4], search[4:]
     rises, usual = rises_of(slope, spacing)
     low, high = np.inf, -np.inf
-    for n in range(len(y)):
+    for n in range(len(landing)):
         if ray_states[n] > 0:
-            low, high = min(low, head_sign * y[n]), max(high, head_sign * y[n])
+            low, high = min(low, head_sign * landing[n, 1]), max(high, head_sign * landing[n, 1])
     start = (low + high) / 2.0
     end = min(low, start - 1e-6)  # a single row has no rear
     near = np.flatnonzero(np.abs(height[0] + shift) < NEAR_RISES * rises)
@@ -353,9 +364,14 @@ def search_level(
         spread[m] = spread_of(height[1, at], rises[at])
     over = np.empty((len(drops), len(near)))
     for m in range(len(near)):
-        share = max((start - head_sign * y[near[m]]) / (start - end), 0.0)
+        at = near[m]
+        share = max((start - head_sign * landing[at, 1]) / (start - end), 0.0)
+        # A ray passes a boundary below the work piece farther from the laser: `height_inside`.
+        rise = 0.0
+        for axis in range(2):
+            rise += slope[at, axis] * (landing[at, axis] - laser[axis]) / laser[2]
         for d in range(len(drops)):
-            over[d, m] = height[0, near[m]] + drops[d] * share * share
+            over[d, m] = height[0, at] + drops[d] * share * share * (1.0 + rise)
     count = int(np.rint(STEPS_PER_REACH * reach)) + 1
     first, step = shift - reach * usual, 2.0 * reach * usual / (count - 1)
     levels = first, step, count
@@ -370,14 +386,14 @@ def search_level(
     return np.array([*level, *rear, *seen, drop_sigma, covariance]), at_ends
 
 
-@_compiled(FLOATS_2, FLOATS_2, FLOATS_1, INTS_1, FLOATS_1, FLOATS_1, FLOATS_1, FLOAT)
+@_compiled(FLOATS_2, FLOATS_2, FLOATS_2, INTS_1, FLOATS_1, FLOATS_1, FLOATS_1, FLOAT)
 def find_level(
     height: FloatArray,
     slope: FloatArray,
-    y: FloatArray,
+    landing: FloatArray,
     ray_states: IntArray,
     spacing: FloatArray,
-    head_and_drop: FloatArray,
+    bench: FloatArray,
     about: FloatArray,
     missing: float,
 ) -> FloatArray:
@@ -393,19 +409,20 @@ def find_level(
     height, slope
         Heights, up to the level, and their standard uncertainty, shape (2, m), mm, and gradients of
         the surface, shape (m, 2), at the landing points of m rays on z = 0.
-    y
-        Y of the landing points, shape (m,), mm.
+    landing
+        The landing points, shape (m, 3), mm.
     ray_states
         +1 lit, −1 dark, shape (m,).
     spacing
         Distance between neighbouring landing points along X and along Y, shape (2,), mm.
-    head_and_drop
+    bench
         +1 where the head lies towards +Y and the rear towards −Y, −1 for the reverse
-        (`Rig.head_sign`); and the depth of the rear, mm, or NaN to find it along with the level.
+        (`Rig.head_sign`); and the position of the laser, mm.
     about
         Initial estimate of the level: its shift, mm, its sign, and the reach of the search in
         rises, the typical change of the height from one ray to the next. If the ends of the grid
-        are likely, a wider one is searched. A reach of NaN: all levels are tried.
+        are likely, a wider one is searched. A reach of NaN: all levels are tried. Then the depth of
+        the rear, mm, or NaN to find it along with the level.
     missing
         Probability that a reflected ray has no dot (`Match.missing`).
 
@@ -416,7 +433,7 @@ def find_level(
         least −log likelihood, number of rays, and usual rise, mm; standard uncertainty of the drop,
         mm, and its covariance with the shift, mm² (`level.Level`), shape (11,).
     """
-    (head_sign, drop), (shift, pool_sign, reach) = head_and_drop, about
+    shift, pool_sign, reach, drop = about
     is_tried = False
     while True:
         if np.isnan(reach):
@@ -428,39 +445,37 @@ def find_level(
         drops = np.array([0.0 if np.isnan(drop) else drop])
         if np.isnan(drop) and pool_sign > 0.0:
             drops = DROPS_MM.copy()
-        search = np.array([head_sign, shift, pool_sign, reach, missing, SUNK_COST])
-        found, at_ends = search_level(height, slope, y, ray_states, spacing, search, drops, BLURS)
+        more = np.array([shift, pool_sign, reach, missing, SUNK_COST])
+        search = np.concatenate((bench, more))
+        found, at_ends = search_level(
+            height, slope, landing, ray_states, spacing, search, drops, BLURS
+        )
         is_wide = reach >= 1.0
         if (is_tried and is_wide) or not at_ends > (MOST_AT_FAR_ENDS if is_wide else MOST_AT_ENDS):
             return found
         reach = np.nan if is_wide else 1.0
 
 
-@_compiled(FLOATS_1, FLOATS_2, INTS_1, FLOATS_1, FLOATS_1, FLOAT, FLOAT, FLOATS_2)
+@_compiled(FLOATS_1, FLOATS_2, INTS_1, FLOATS_1, FLOATS_1, FLOAT, FLOATS_2)
 def negative_log_evidence(
     height: FloatArray,
     slope: FloatArray,
     ray_states: IntArray,
     spacing: FloatArray,
-    boundary_height: FloatArray,
-    pool_sign: float,
+    inside: FloatArray,
     missing: float,
     blurs: FloatArray,
 ) -> float:
     """−log probability of the states of rays, marginalised over levels near 0 and blurs, nats.
 
-    ``boundary_height`` is that at the m landing points, shape (m,), mm. ``blurs`` is
+    ``inside`` is the height over the boundary (`Level.height_inside`), shape (m,), mm. ``blurs`` is
     that of `search_level`, ``height`` is taken as exact, shape (m,), mm, and the others are those
     of `find_level`. A constant is omitted.
     """
     rises, usual = rises_of(slope, spacing)
     near = np.flatnonzero(np.abs(height) < NEAR_RISES * rises)
-    over, signed_sharpness = np.empty((1, len(near))), np.empty(len(near))
-    dark = np.empty(len(near), np.bool_)
-    for m in range(len(near)):
-        at = near[m]
-        over[0, m] = height[at] - boundary_height[at]
-        signed_sharpness[m], dark[m] = pool_sign * ray_states[at] / rises[at], ray_states[at] < 0
+    over, dark = inside[near].reshape(1, -1), ray_states[near] < 0
+    signed_sharpness = ray_states[near] / rises[near]
     exact = np.zeros(len(near))
     levels = -usual, usual / STEPS_PER_REACH, 2 * STEPS_PER_REACH + 1
     nats = level_negative_log_likelihood(

@@ -31,6 +31,7 @@ def _level_of_round(
     grid: FloatArray,
     coefficients: FloatArray,
     points: FloatArray,
+    laser: FloatArray,
     level_input: tuple[BoolArray, FloatArray, IntArray, FloatArray, FloatArray],
     level: FloatArray,
     limits: FloatArray,
@@ -50,10 +51,11 @@ def _level_of_round(
     reach = LEVEL_REACH if count else FIRST_REACH
     if level[8] > 0.0:
         reach = min(max(reach, REACH_SIGMAS * level[1] / level[8]), 1.0)
-    about = np.array([0.0, level[2], reach if count or is_near != 0.0 else np.nan])
-    head_and_drop = np.array([head_sign, level[3] if is_held else np.nan])
-    seen = height, there[1:].T, landing[:, 1], ray_states, spacing
-    found = find_level(*seen, head_and_drop, about, missing)
+    reach = reach if count or is_near != 0.0 else np.nan
+    about = np.array([0.0, level[2], reach, level[3] if is_held else np.nan])
+    bench = np.array([head_sign, laser[0], laser[1], laser[2]])
+    seen = height, there[1:].T, landing, ray_states, spacing
+    found = find_level(*seen, bench, about, missing)
     if is_held:
         found[1], found[9:] = max(found[1], level[1]), level[9:]
     return found
@@ -118,7 +120,7 @@ def run_rounds(
             grid, bands, coefficients, from_smooth, points, weights, bench, dots
         )
         if with_level and not (count and abs(level[0]) < limits[9]):
-            at = grid, coefficients, points, level_input, level, limits
+            at = grid, coefficients, points, laser, level_input, level, limits
             level = _level_of_round(count, *at)
             coefficients += level[0]  # the splines add up to 1
         points, moved = newton_along_rays(grid, coefficients, rays, points, int(steps))

@@ -10,7 +10,7 @@ from numba import types
 
 from labapp.core.compiled import BAND, FLOATS_1, FLOATS_2, FLOATS_3, INT, INTS_1
 from labapp.core.compiled import compiled as _compiled
-from labapp.core.surface.kernels.level_kernels import find_level
+from labapp.core.surface.kernels.level_kernels import BLURS, DROPS_MM, search_level, sunk_cost
 from labapp.core.surface.kernels.solver_kernels import gradient_rhs, newton_along_rays, solve
 from labapp.core.surface.kernels.spline_kernels import surface_at
 from labapp.core.values import FloatArray, IntArray
@@ -22,6 +22,11 @@ _known_rays = types.Tuple((FLOATS_2, INTS_1, FLOATS_1, FLOATS_1))  # type: ignor
 NEWTON_STEPS = 2
 """Newton steps from where the rays of a slightly perturbed bench pass at the height of the
 unperturbed reflection points, which is very close to the surface."""
+
+# Fewer drops and blurs than for the level itself (`find_level`): only their changes are needed.
+FEW_DROPS_MM = np.concatenate([[0.0], DROPS_MM[2::2]])
+FEW_SUNK_COST = sunk_cost(FEW_DROPS_MM)
+FEW_BLURS = np.ascontiguousarray(BLURS[:, ::2])
 
 
 @_compiled(FLOATS_2, FLOATS_1, BAND, FLOATS_2, FLOATS_3, _own, _moved, INT)
@@ -87,10 +92,10 @@ def level_changes(
     aside: FloatArray,
     search: FloatArray,
 ) -> FloatArray:
-    """Changes of the level for q perturbed benches, shape (q,), mm.
+    """Changes of the level and of the rear's drop for q perturbed benches, shape (q, 2), mm.
 
-    The level responds in steps: half the difference between the bench perturbed one way and the
-    other is used.
+    They respond in steps: half the difference between the bench perturbed one way and the other is
+    used.
 
     Parameters
     ----------
@@ -104,23 +109,24 @@ def level_changes(
     aside
         Displacements of the landing points on each bench, shape (q, m, 3), mm.
     search
-        Side of the head, drop of the rear, sign of the pool, reach of the search in rises, and
-        share of missing dots.
+        Side of the head, position of the laser, mm, sign of the pool, reach of the search in rises,
+        and share of missing dots.
     """
     landing, ray_states, sigma, spacing = known_rays
-    head_sign, drop, pool_sign, reach, missing = search
-    head_and_drop, about = np.array([head_sign, drop]), np.array([0.0, pool_sign, reach])
-    height, levels = np.empty((2, len(ray_states))), np.empty(len(changes))
+    bench, (pool_sign, reach, missing) = search[:4], search[4:]
+    drops = FEW_DROPS_MM.copy() if pool_sign > 0.0 else np.zeros(1)
+    about = np.concatenate((bench, np.array([0.0, pool_sign, reach, missing, FEW_SUNK_COST])))
+    height, levels = np.empty((2, len(ray_states))), np.empty((len(changes), 2))
     height[1] = sigma
     for k in range(len(changes)):
-        shifts = np.empty(2)
+        found = np.empty((2, 11))
         for n in range(2):
             way = 1.0 - 2.0 * n
             places = landing + way * aside[k]
             there = surface_at(grid, coefficients + way * changes[k], places)
             height[0] = there[0]
-            seen = height, there[1:].T, places[:, 1], ray_states, spacing
-            found = find_level(*seen, head_and_drop, about, missing)
-            shifts[n] = found[0]
-        levels[k] = (shifts[0] - shifts[1]) / 2.0
+            seen = height, there[1:].T, places, ray_states, spacing
+            found[n] = search_level(*seen, about, drops, FEW_BLURS)[0]
+        levels[k, 0] = (found[0, 0] - found[1, 0]) / 2.0
+        levels[k, 1] = (found[0, 3] - found[1, 3]) / 2.0
     return levels
