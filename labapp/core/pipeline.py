@@ -2,6 +2,7 @@
 
 1. `tuned_dots`, or `find_dots` for another detector: the reflected dots of the frame (§5.2.1).
 2. `find_lattice`: their rows and columns in the picture, as far as they can be determined (§5.2.2).
+   A frame that is not matched keeps them, numbered as on the imaging plane (`number_on_plane`).
 3. `match_rays`: which ray made which dot (§4.2.2); then rows and columns are those of the rays.
 4. `fit.fit_surface`, or `reconstruct` for another scheme: the pool's surface (ch. 6, 7).
 5. `fit.bound_and_measure`, or `measure_surface` for another scheme: its size and reflection errors
@@ -36,7 +37,7 @@ from labapp.core.matching.observation import Observation
 from labapp.core.matching.unexplained import NOTHING_EXPLAINS
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
-from labapp.core.rows.lattice import Lattice
+from labapp.core.rows.lattice import Lattice, number_on_plane
 from labapp.core.schemes import SCHEMES, ers, fit, irs, modal, zonal
 from labapp.core.surface import measures
 from labapp.core.surface.pool_fit import FitSettings
@@ -240,11 +241,10 @@ def measure(
         else:
             dots, tuning = _dots_and_tuning(image, settings.dots)
             on_step("dots")
-            found_lattice, no_lattice = _lattice_or_why(dots, frame_shape, settings.lattice)
-            result = replace(result, dots=dots, lattice=found_lattice)
-            match, initial = _match_or_why(
-                dots, found_lattice, no_lattice, bench, frame_shape, match_settings
-            )
+            found, no_rows = _lattice_or_why(dots, frame_shape, settings.lattice)
+            numbered = found and number_on_plane(found, dots, bench.calibration)
+            result = replace(result, dots=dots, lattice=numbered)
+            match, initial = _match_or_why(dots, found, no_rows, bench, frame_shape, match_settings)
             lattice = lattice_of_match(match, rig, len(dots))
         result = replace(result, match=match, lattice=lattice)
         if settings.scheme != "fit":

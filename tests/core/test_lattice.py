@@ -7,8 +7,9 @@ from itertools import product
 import numpy as np
 import pytest
 
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.rows.jump_kernels import without_jumps
-from labapp.core.rows.lattice import Lattice
+from labapp.core.rows.lattice import Lattice, number_on_plane
 from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice, merge_grids
 from labapp.core.rows.lattice_kernels import BORDER, grow
 from labapp.core.values import CannotMeasure, ComplexArray, FloatArray, IntArray
@@ -278,3 +279,29 @@ def test_handful_of_dots_raises_too_few_dots() -> None:
     with pytest.raises(CannotMeasure) as error:
         grow_lattice(as_dots(bowed(sites()[:5])), GrowSettings())
     assert error.value.status == "too-few-dots"
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        pytest.param([[1, 0], [0, 1]], id="as usual"),
+        pytest.param([[-1, 0], [0, 1]], id="mirrored"),
+        pytest.param([[1, 0], [0, -1]], id="mirrored upside down"),
+        pytest.param([[-1, 0], [0, -1]], id="upside down"),
+        pytest.param([[0, 1], [1, 0]], id="turned and mirrored"),
+        pytest.param([[0, -1], [1, 0]], id="turned left"),
+        pytest.param([[0, 1], [-1, 0]], id="turned right"),
+    ],
+)
+def test_rows_are_numbered_as_on_the_imaging_plane(view: list[list[int]]) -> None:
+    hidden = {(5, 7), (3, 4), (3, 5)}  # a hole, and a row with hidden dots
+    site = np.array([s for s in sites().tolist() if tuple(s) not in hidden])
+    to_picture = np.eye(3)
+    to_picture[:2, :2], to_picture[:2, 2] = np.array(view, float), 700.0
+    seen = bowed(site, 0.6, 0.03) @ to_picture[:2, :2].T + to_picture[:2, 2]
+    to_plane = np.diag([1.0, -1.0, 1.0]) @ np.linalg.inv(to_picture)
+    dots = as_dots(seen)
+    lattice = number_on_plane(grow_lattice(dots, GrowSettings()), dots, ImageCalibration(to_plane))
+    np.testing.assert_array_equal(np.stack([lattice.row, lattice.column], axis=-1), site)
+    assert (5, 7) in lattice.candidates
+    assert lattice.blocked_rows == {3}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 
 from labapp.config.setup import read_setup
 from labapp.core.geometry.bench import Bench
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.images.dots import Dots
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.pipeline import (
@@ -327,6 +329,44 @@ def test_frame_with_few_dots_has_status_too_few_dots(count: int) -> None:
     result = measure(frame, SETUP.bench, Settings())[0]
     assert result.status == "too-few-dots"
     assert result.reason
+
+
+@pytest.mark.parametrize(
+    "turn", [np.fliplr, np.flipud, np.transpose], ids=lambda turn: turn.__name__
+)
+def test_frame_of_a_mirrored_camera_can_be_corrected(
+    images: dict[int, npt.NDArray[np.generic]],
+    measurements: dict[int, Measurement],
+    turn: Callable[[FloatArray], FloatArray],
+) -> None:
+    """Rows of a frame without a match are numbered as those of others: on the imaging plane."""
+    image, usual = images[FRAMES[0]].astype(float), measurements[FRAMES[0]]
+    assert usual.lattice is not None
+    assert usual.dots is not None
+    assert usual.lattice.reference is not None
+    k, t = usual.lattice.reference
+    beside = (usual.lattice.row == k) & (abs(usual.lattice.column - t) == 1)
+    hole_px = usual.dots.image_px[beside].mean(axis=0)
+    v, u = np.indices(image.shape).astype(float)
+    false = 60.0 * np.exp(-((u - hole_px[0]) ** 2 + (v - hole_px[1]) ** 2) / 8.0)
+    # The place in the usual picture of the first pixels of the other one.
+    places = np.stack([turn(u), turn(v)], axis=-1)
+    origin, on_u, on_v = places[0, 0], places[0, 1], places[1, 0]
+    to_usual = np.eye(3)
+    to_usual[:2] = np.stack([on_u - origin, on_v - origin, origin], axis=-1)
+    bench = Bench(SETUP.rig, ImageCalibration(SETUP.calibration.matrix @ to_usual))
+    refused = measure(turn(image + false), bench, Settings())[0]
+    assert refused.status == "no-reference"
+    start = start_correction(refused)
+    at_px = np.linalg.solve(to_usual[:2, :2], hole_px - origin)
+    nearest = int(np.argmin(np.linalg.norm(start.dots.image_px - at_px, axis=-1)))
+    corrected = measure(turn(image), bench, Settings(), correction=delete_dots(start, [nearest]))[0]
+    assert corrected.status == "ok"
+    assert corrected.match is not None
+    assert corrected.match.orientation == "S/S"
+    assert corrected.measures is not None
+    assert usual.measures is not None
+    assert corrected.measures.height_mm == pytest.approx(usual.measures.height_mm, rel=0.002)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.images.dots import Dots
 from labapp.core.values import IntArray, ReadOnlyArrays
 
@@ -86,6 +87,46 @@ def find_holes(dot_at: dict[Site, int], dots: Dots) -> list[tuple[Site, int]]:
         if np.abs(points - (left + right) / 2).min() > HOLE_DISTANCE * abs(right - left):
             holes.append(((k, t), sum(lit)))
     return sorted(holes, key=lambda hole: (-hole[1], hole[0]))
+
+
+def number_on_plane(lattice: Lattice, dots: Dots, calibration: ImageCalibration) -> Lattice:
+    """Number the rows along Z′ and the columns along X′, as those of matched dots are.
+
+    In the picture they run otherwise if the camera sees the imaging plane mirrored, upside down or
+    turned.
+
+    Parameters
+    ----------
+    lattice, dots
+        Rows and columns in the picture, upwards and to the right, and their dots.
+    calibration
+        Mapping between the picture and the imaging plane.
+    """
+    right, down = calibration.jacobian(dots.image_px.mean(axis=0)).T
+    turned = abs(right[0]) + abs(down[1]) < abs(right[1]) + abs(down[0])
+    row, column = (lattice.column, lattice.row) if turned else (lattice.row, lattice.column)
+    upwards, rightwards = (right[1], -down[0]) if turned else (-down[1], right[0])
+    if not turned and upwards > 0 and rightwards > 0:
+        return lattice
+    last_row, last_column = row.max() + 1, column.max() + 1
+
+    def on_plane(site: Site) -> Site:
+        k, t = reversed(site) if turned else site
+        return (
+            int(k if upwards > 0 else last_row - k),
+            int(t if rightwards > 0 else last_column - t),
+        )
+
+    row = row if upwards > 0 else np.where(row > 0, last_row - row, 0)
+    column = column if rightwards > 0 else np.where(column > 0, last_column - column, 0)
+    sited = (row > 0) & (column > 0)
+    blocked = (
+        _blocked_rows(np.stack([row, column], axis=-1)[sited])
+        if turned
+        else frozenset(on_plane((k, 1))[0] for k in lattice.blocked_rows)
+    )
+    reference = None if lattice.reference is None else on_plane(lattice.reference)
+    return Lattice(row, column, reference, tuple(map(on_plane, lattice.candidates)), blocked)
 
 
 def empty_sites(lattice: Lattice) -> list[Site]:

@@ -14,10 +14,12 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QHBoxLayout, QToolButton, QWidget
 from pytestqt.qtbot import QtBot
 
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.pipeline import start_correction
 from labapp.core.rows.correction import Correction, add_dot, delete_dots, shift_row
 from labapp.core.rows.find_lattice import LatticeSettings
+from labapp.core.rows.lattice import Lattice
 from labapp.errors import InputError
 from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.fitting import Processes, Refit
@@ -27,6 +29,7 @@ from labapp.gui.tasks import Cancelled, Control
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT, let_draw
+from tests.scenes import as_dots
 
 CopySample = Callable[[str], Path]
 SIZE = presenter.NUMBERS[0]
@@ -769,3 +772,18 @@ def test_cancelled_detection_looks_for_no_rows(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(presenter, "find_lattice", lambda *_: pytest.fail("it goes on"))
     with pytest.raises(Cancelled):
         presenter.detect(np.zeros((8, 8)), 0, (DotSettings(), LatticeSettings()), control)
+
+
+def test_detected_columns_are_those_of_the_plane_if_the_picture_is_mirrored(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    left_to_right = Lattice(np.array([1, 1]), np.array([1, 2]))
+    dots = as_dots(np.array([[10.0, 20.0], [30.0, 20.0]]))
+    monkeypatch.setattr(presenter, "find_dots", lambda *_: dots)
+    monkeypatch.setattr(presenter, "find_lattice", lambda *_: left_to_right)
+    mirrored = ImageCalibration(np.diag([-1.0, -1.0, 1.0]))
+    by = DotSettings(), LatticeSettings()
+    found = presenter.detect(np.zeros((8, 8)), 0, by, Control(), mirrored)
+    assert found.correction.lattice.column.tolist() == [2, 1]
+    found = presenter.detect(np.zeros((8, 8)), 0, by, Control())
+    assert found.correction.lattice.column.tolist() == [1, 2]

@@ -9,13 +9,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.pipeline import Measurement, Settings, start_correction
 from labapp.core.rows.carry_on import carry_on
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
-from labapp.core.rows.lattice import Lattice
+from labapp.core.rows.lattice import Lattice, number_on_plane
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
@@ -137,9 +138,16 @@ def _automatic(result: Result, by: tuple[DotSettings, LatticeSettings]) -> bool:
 
 
 def detect(
-    image: Image, frame: int, by: tuple[DotSettings, LatticeSettings], control: Control
+    image: Image,
+    frame: int,
+    by: tuple[DotSettings, LatticeSettings],
+    control: Control,
+    calibration: ImageCalibration | None = None,
 ) -> DetectedDots:
-    """Detect dots and rows in a frame without measuring it."""
+    """Detect dots and rows in a frame without measuring it.
+
+    With a calibration they are numbered as on the imaging plane, otherwise as in the picture.
+    """
     dots: Dots | None = None
     lattice: Lattice | None = None
     why = ""
@@ -147,6 +155,8 @@ def detect(
         dots = find_dots(image, by[0])
         control.check()
         lattice = find_lattice(dots, (image.shape[0], image.shape[1]), by[1])
+        if calibration is not None:
+            lattice = number_on_plane(lattice, dots, calibration)
     except CannotMeasure as answer:
         why = answer.reason
     start = start_correction(Measurement("", "", "fit", dots, lattice))
