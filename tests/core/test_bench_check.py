@@ -223,6 +223,18 @@ def test_check_in_setup_file_is_valid_until_a_value_changes():
     assert unchecked.calibration.lens is None
 
 
+@pytest.mark.parametrize("view", [[[-1, 0], [0, 1]], [[-1, 0], [0, -1]], [[0, 1], [1, 0]]], ids=str)
+def test_plate_is_labelled_if_the_camera_is_mirrored_or_turned(view: list[list[int]]) -> None:
+    usual, ray = picture(Plate(), FlatMirror(), EXACT, np.random.default_rng(3))
+    to_seen = np.eye(3)
+    to_seen[:2, :2], to_seen[:2, 2] = view, np.negative(view).clip(0).sum(axis=1) * 640
+    seen = usual.dots.image_px @ to_seen[:2, :2].T + to_seen[:2, 2]
+    plate = MirrorDots("plate", Plate(), as_dots(seen, 0.12), (640, 640))
+    calibration = ImageCalibration(CALIBRATION.matrix @ np.linalg.inv(to_seen))
+    labels = label_picture(plate, RIG, calibration).labels
+    assert labels[tuple(ray.T)].tolist() == list(range(len(ray)))
+
+
 @pytest.mark.slow
 def test_written_setup_is_the_adjusted_one():
     """The setup has a lens, and the picture is shifted; residuals are those of the adjustment."""

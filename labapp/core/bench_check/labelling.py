@@ -26,7 +26,7 @@ from labapp.core.images.dots import Dots
 from labapp.core.matching.hypothesis import labels_from_lattice
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
-from labapp.core.rows.lattice import empty_sites
+from labapp.core.rows.lattice import empty_sites, number_on_plane
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 LEAST_DOTS = 12
@@ -174,12 +174,13 @@ def _likeliest(starts: list[IntArray], observed: Observation) -> list[IntArray]:
 
 
 def _by_lattice(observed: Observation, picture: MirrorDots) -> list[IntArray]:
-    """Labels from the rows and columns in the picture, for the absent ray at each empty site."""
+    """Labels from the rows and columns of the dots, for the absent ray at each empty site."""
     pattern = observed.rig.pattern
     try:
         lattice = find_lattice(picture.dots, picture.frame_shape, LatticeSettings())
     except CannotMeasure:
         return []
+    lattice = number_on_plane(lattice, picture.dots, observed.bench.calibration)
     assert pattern.marker is not None
     shape = (pattern.rows, pattern.columns)
     sites = dict.fromkeys([*lattice.candidates, *empty_sites(lattice)])
