@@ -165,6 +165,17 @@ def test_size_uncertainty_is_the_spread_over_the_posterior(seen: Pool) -> None:
     assert np.isnan(reconstruction.size_sigma[3])  # the lowest point is on the rim
 
 
+def test_wetting_slope_of_a_cap_is_that_at_its_boundary() -> None:
+    """One per cent inside, it would be smaller by one per cent, which is 2.5 σ here."""
+    pool = spherical_cap(5.6, 0.25)
+    match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG)
+    surface = fit.fit_surface(match, OPEN_RIG, FitSettings())
+    found = fit.bound_and_measure(match, surface, OPEN_RIG, FitSettings())[1]
+    # A sphere's cap of height h over a circle of radius a ends at the angle 2 atan(h/a).
+    expected = np.degrees(2 * np.arctan(0.25 / 2.8))
+    assert abs(found.wetting_slope_deg - expected) < 0.5 * found.wetting_slope_sigma_deg
+
+
 def random_pool(rng: np.random.Generator, kind: int) -> Pool:
     """Return a cap, ellipse, egg or concave cap, up to 0.5 mm off the origin in X and Y."""
     width = rng.uniform(4.5, 8.0)

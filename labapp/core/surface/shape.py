@@ -13,9 +13,12 @@ import numpy as np
 
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.level import Rear
-from labapp.core.surface.spline import SplineBasis
+from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
+
+INSIDE = 0.99
+"""Fraction of the way from centre to boundary at which interpolated surfaces have a slope."""
 
 
 def shape_of(surface: Surface, boundary: Boundary) -> FloatArray:
@@ -26,7 +29,8 @@ def shape_of(surface: Surface, boundary: Boundary) -> FloatArray:
     * Asymmetry: volume between surface and work piece right of that section (+X) minus that left
       of it, over their sum; volumes below the work piece are positive too.
     * Wetting slope: mean angle along the boundary between the surface and the work piece; positive
-      if the surface rises inwards.
+      if the surface rises inwards. An interpolated surface has no slope at the boundary itself:
+      that at `INSIDE` is used.
 
     Parameters
     ----------
@@ -37,8 +41,11 @@ def shape_of(surface: Surface, boundary: Boundary) -> FloatArray:
     """
     from labapp.core.surface.kernels import shape_kernels
 
+    edge = 1.0 if isinstance(surface, SplineSurface) else INSIDE
     return shape_kernels.shape_parameters(
-        *_samples(boundary, lambda at: surface.height(*at.T), lambda at: surface.gradient(*at.T))
+        *_samples(
+            boundary, edge, lambda at: surface.height(*at.T), lambda at: surface.gradient(*at.T)
+        )
     )
 
 
@@ -66,7 +73,7 @@ def shape_and_gradients(
     def at(place_mm: FloatArray) -> FloatArray:
         return spline_kernels.surface_at(basis.grid, coefficients, place_mm)
 
-    spokes, rim = _samples(boundary, lambda place: at(place)[0], lambda place: at(place)[1:].T)
+    spokes, rim = _samples(boundary, 1.0, lambda place: at(place)[0], lambda place: at(place)[1:].T)
     parameters = shape_kernels.shape_parameters(spokes, rim)
     return parameters, shape_kernels.shape_gradients(
         basis.grid,
@@ -85,17 +92,19 @@ _Samples = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 def _samples(
     boundary: Boundary,
+    edge: float,
     height: Callable[[FloatArray], FloatArray],
     gradient: Callable[[FloatArray], FloatArray],
 ) -> tuple[_Samples, _Samples]:
-    """Sample a surface on spokes from the middle of its boundary, and next to the boundary.
+    """Sample a surface on spokes from the middle of its boundary, and at or beside the boundary.
 
-    Its height, shape (n,), and gradient, shape (n, 2), are functions of places, shape (n, 2), mm.
-    Returns the ``spokes`` and the ``rim`` of `shape_kernels.shape_gradients`.
+    ``edge`` is the fraction of the way there from the centre. The surface's height, shape (n,), and
+    gradient, shape (n, 2), are functions of places, shape (n, 2), mm. Returns the ``spokes`` and
+    the ``rim`` of `shape_kernels.shape_gradients`.
     """
     from labapp.core.surface.kernels import shape_kernels
 
-    spokes, rim = shape_kernels.sample_places(boundary.points_mm, boundary.center_mm)
+    spokes, rim = shape_kernels.sample_places(boundary.points_mm, boundary.center_mm, edge)
     (_, _, place_mm), (_, inward, rim_mm) = spokes, rim
     height_mm = height(place_mm.reshape(-1, 2)).reshape(place_mm.shape[:2])
     return (*spokes, height_mm), (*rim, np.vecdot(gradient(rim_mm), inward))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from labapp.core.compiled import FLOATS_1, FLOATS_2, FLOATS_3
+from labapp.core.compiled import FLOAT, FLOATS_1, FLOATS_2, FLOATS_3
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
 from labapp.core.surface.kernels.spline_kernels import (
@@ -37,9 +37,6 @@ ENDS = np.array([0, SPOKES // 2])
 
 RIGHT = (1 + np.sign(np.round(WAY[:, 0], 9))) / 2
 """Share of each spoke that is right of that section."""
-
-RIM = 0.99
-"""Fraction of the distance from centre to boundary at which the slope is evaluated."""
 
 STEP_MM = 0.01
 """Step of the finite differences of slopes."""
@@ -70,11 +67,13 @@ def _around(angle: FloatArray, order: IntArray, values: FloatArray, phi: float) 
     return float(values[before] + share * (values[after] - values[before]))
 
 
-@_compiled(FLOATS_2, FLOATS_1)
+@_compiled(FLOATS_2, FLOATS_1, FLOAT)
 def sample_places(
-    outline: FloatArray, center: FloatArray
+    outline: FloatArray, center: FloatArray, edge: float
 ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
-    """Places on spokes from the middle of the boundary, and beside the boundary.
+    """Places on spokes from the middle of the boundary, and at or beside the boundary.
+
+    ``edge`` is the fraction of the way from centre to boundary at which the slope is evaluated.
 
     Returns
     -------
@@ -106,7 +105,7 @@ def sample_places(
         length[k] = np.hypot(x, y)
         inward[k, 0], inward[k, 1] = -y / length[k], x / length[k]
         for axis in range(2):
-            rim[k, axis] = center[axis] + RIM * (outline[k, axis] - center[axis])
+            rim[k, axis] = center[axis] + edge * (outline[k, axis] - center[axis])
     return (middle, reach, place), (length, inward, rim)
 
 
@@ -245,7 +244,7 @@ def _wetting(
         for axis in range(2):
             grown = (pull[k - 1, axis] - pull[(k + 1) % count, axis]) / 2
             moved = -boundary_slope[k, axis] / (a * a + b * b)
-            by_move += (RIM * turned * bend[axis] + grown) * moved
+            by_move += (turned * bend[axis] + grown) * moved
         accumulate_at_boundary(grid, rear, outline[k, 0], outline[k, 1], by_move, work, out)
     return 0.0
 
