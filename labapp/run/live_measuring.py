@@ -42,6 +42,9 @@ class LiveResult(FrameResult):
     """Its surface for drawing, if requested; None if it could not be measured."""
 
 
+ENDED = "the measuring process has ended"
+
+
 class LiveMeasuring:
     """Measures frames in one process; each call waits for its frame."""
 
@@ -63,9 +66,13 @@ class LiveMeasuring:
             If the process has ended.
         """
         try:
-            return self._pool.submit(_measured, frame, with_scene).result()
-        except (BrokenProcessPool, CancelledError, RuntimeError) as error:
-            raise LiveMeasuringEnded("the measuring process has ended") from error
+            pending = self._pool.submit(_measured, frame, with_scene)
+        except RuntimeError as error:  # also if it was closed; faults of the work come later
+            raise LiveMeasuringEnded(ENDED) from error
+        try:
+            return pending.result()
+        except (BrokenProcessPool, CancelledError) as error:
+            raise LiveMeasuringEnded(ENDED) from error
 
     def close(self) -> None:
         """Terminate the process. May be called twice."""

@@ -136,10 +136,12 @@ class LiveWatch:
             if measuring is not self._measuring:
                 return  # the set-up was changed, or this was closed
             self._measuring, self.stopped = None, words
+            self._measured_s = float("inf")  # this is the reason for the silence
+            # Within the lock: a new set-up must not be followed by these.
+            self._on_event(Event(self._name, "warning", words), None)
+            self._raise_silence(words)
         logging.getLogger(NAME).error("live figures", exc_info=error)
         measuring.close()
-        self._on_event(Event(self._name, "warning", words), None)
-        self._raise_silence(words)
 
     def _judge(self, result: LiveResult) -> None:
         """Raise alarms, or end them."""

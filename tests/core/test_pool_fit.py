@@ -34,7 +34,7 @@ from labapp.core.surface.solver import Rounds
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.forward import exact_match, trace
-from labapp.simulation.pools import LowRear, Pool, egg, spherical_cap
+from labapp.simulation.pools import Footprint, LowRear, Pool, egg, spherical_cap
 from tests.benchmarks.clutter import draw_pool
 from tests.levels import find_level
 from tests.scenes import OPEN_RIG
@@ -322,24 +322,33 @@ def test_rear_sinks_although_no_dark_ray_is_seen_there() -> None:
         assert not less[WITH_SIGMA.index("height_mm")]
 
 
-def test_rays_pass_a_low_boundary_farther_from_the_laser() -> None:
+@pytest.mark.parametrize("side", [1, -1])
+def test_rays_pass_a_low_boundary_farther_from_the_laser(side: int) -> None:
+    """If the boundary lies towards the laser, those that land outside meet the work piece."""
     rays, laser = project_rays(OPEN_RIG.laser, OPEN_RIG.pattern), OPEN_RIG.laser.position_mm
-    landing = rays.landing_mm[9]
-    level = Level(0.0, 0.0, 1, Rear(0.05, 8.0, -3.0), 0.0)
-    slope = np.tile([0.05, 0.25], (len(landing), 1))
+    landing = rays.landing_mm[9] * [1, side, 1]
+    level = Level(0.0, 0.0, 1, Rear(0.05, 8.0 * side, -3.0 * side), 0.0)
+    slope = np.tile([0.05, 0.25 * side], (len(landing), 1))
     passed = landing
     for _ in range(20):
         depth = -level.rear.height(passed[:, 1])[:, None]
-        passed = landing + depth / laser[2] * (landing - laser)
-    over = passed[:, :2] @ slope[0] - passed[:, 2]
+        passed = landing + depth / laser[2] * (landing - laser) * (side > 0)
+    over = passed[:, :2] @ slope[0] - level.rear.height(passed[:, 1])
     found = level.height_inside(landing[:, :2] @ slope[0], slope, landing, laser)
     np.testing.assert_allclose(found, over, atol=5e-4)
 
 
-def test_lengths_of_pools_with_a_low_rear_are_as_uncertain_as_stated() -> None:
+@pytest.mark.parametrize("travel", ["+y", "-y"])
+def test_lengths_of_pools_with_a_low_rear_are_within_twice_their_uncertainty(travel: str) -> None:
     deviations = []
     for seed in range(20):
         rig, pool = draw_pool("lowrear", np.random.default_rng(seed))
+        if travel == "-y":
+            footprint, (low,) = pool.footprint, pool.terms
+            x, y = footprint.center_mm
+            back = Footprint(footprint.width_mm, footprint.tail_mm, footprint.head_mm, (x, -y))
+            low = replace(low, towards=1)
+            pool, rig = replace(pool, footprint=back, terms=(low,)), replace(rig, travel="-y")
         match = exact_match(trace(pool, rig), rig)
         fitted = fit.fit_surface(match, rig, FitSettings())
         size = fit.bound_and_measure(match, fitted, rig, FitSettings())[1]

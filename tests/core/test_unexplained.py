@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
-from labapp.core.matching import match_rays, repair, unexplained
+from labapp.core.matching import decision, match_rays, repair, unexplained
 from labapp.core.matching.hypothesis import Hypothesis, evaluate
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.matching.repair import with_repaired
 from labapp.core.matching.unexplained import explains, suffices
 from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice
-from labapp.core.values import IntArray
+from labapp.core.values import CannotMeasure, IntArray
 from labapp.simulation.pools import egg
 from tests.benchmarks.dips import draw, matched
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see, true_labels
@@ -177,3 +178,20 @@ def test_nothing_is_repaired_if_only_isolated_dots_are_left(grown: list[IntArray
     observed, found = hypothesis(seen_with(false=10, seed=ISOLATED))
     assert with_repaired(observed, [], [found]) == [found]
     assert not grown
+
+
+def test_rows_are_ambiguous_if_the_marker_between_dark_rays_has_no_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = seen_with(false=0)
+    labels = true_labels(seen)
+    i, j = np.array(BENCH_RIG.pattern.marker) - 1
+    labels[[i - 1, i + 1, i], [j, j, j - 1]] = UNLABELLED
+    observed, found = hypothesis(seen, labels)
+    decision._refuse_hidden_marker(observed, found)
+    paths = decision.paths_of(observed, found.pool)
+    nowhere = replace(paths, plane_mm=np.full_like(paths.plane_mm, np.nan))
+    monkeypatch.setattr(decision, "paths_of", lambda *_: nowhere)
+    with pytest.raises(CannotMeasure) as caught:
+        decision._refuse_hidden_marker(observed, found)
+    assert caught.value.status == "ambiguous-rows"

@@ -8,10 +8,12 @@ import os
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -511,3 +513,16 @@ def test_model_predicts_only_from_measured_frames(watch: LiveWatch):
         assert lines[2]["penetration_sigma_mm"] == pytest.approx(np.hypot(0.1, 0.5 * 0.03))
         watch._raise_silence("nothing came")
         assert "penetration_mm" not in json.loads(file.readline())
+
+
+def test_a_fault_of_the_measuring_is_not_taken_for_its_end(
+    setup: Setup, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failed: Future[LiveResult | None] = Future()
+    failed.set_exception(RecursionError("too deep"))
+    monkeypatch.setattr(
+        live_measuring, "worker_pool", lambda *_: SimpleNamespace(submit=lambda *_: failed)
+    )
+    measuring = LiveMeasuring(setup, Settings(), 8)
+    with pytest.raises(RecursionError):
+        measuring.measure(frame(1))

@@ -159,11 +159,16 @@ def _refuse_hidden_marker(observed: Observation, best: Hypothesis) -> None:
         return
     place = paths_of(observed, best.pool).plane_mm[np.ravel_multi_index(at, best.labels.shape)]
     nearest = np.argsort(np.linalg.norm(observed.plane_mm - place, axis=-1))[:NEAREST]
-    has_place = np.isfinite(place).all()
-    if not has_place or np.count_nonzero(~np.isin(nearest, best.labels)) >= FREE:
-        raise CannotMeasure(
-            "ambiguous-rows", "most dots beside the absent centre dot, and others, have no ray"
-        )
+    free = np.count_nonzero(~np.isin(nearest, best.labels))
+    if not np.isfinite(place).all():
+        others = "the surface does not reflect its ray onto the plane"
+    elif free >= FREE:
+        others = f"{free} of the {NEAREST} dots nearest to where it would be have none"
+    else:
+        return
+    raise CannotMeasure(
+        "ambiguous-rows", f"most dots beside the absent centre dot have no ray, and {others}"
+    )
 
 
 def _excess(rival: Hypothesis, cheapest: Hypothesis) -> float:

@@ -113,8 +113,7 @@ class Level:
     ) -> FloatArray:
         """Height of the surface, on the pool's side, over the boundary where rays pass it.
 
-        It is above 0 for rays that land inside. A ray passes a boundary below the work piece
-        farther from the laser than it would land on z = 0.
+        It is above 0 for rays that land inside.
 
         Parameters
         ----------
@@ -122,11 +121,17 @@ class Level:
             The surface and its gradient at the landing points, shapes (m,), mm, and (m, 2).
         landing_mm, laser_mm
             Landing points on z = 0, shape (m, 3), and position of the laser, shape (3,), mm.
+
+        Returns
+        -------
+        ndarray
+            Shape (m,), mm.
         """
-        boundary_mm = self.rear.height(landing_mm[:, 1])
-        per_depth = (landing_mm - laser_mm)[:, :2] / laser_mm[2]
-        there = height_mm - boundary_mm * np.sum(slope * per_depth, axis=-1)
-        return np.asarray(self.pool_sign * (there - boundary_mm))
+        from labapp.core.surface.kernels import ray_kernels
+
+        per_depth = ray_kernels.rise_per_depth(slope, landing_mm, laser_mm)
+        over_mm = height_mm - self.rear.height(landing_mm[:, 1]) * per_depth
+        return np.asarray(self.pool_sign * over_mm)
 
     @property
     def disagreement_bits(self) -> float:

@@ -783,7 +783,6 @@ def test_detected_columns_are_those_of_the_plane_if_the_picture_is_mirrored(
     monkeypatch.setattr(presenter, "find_lattice", lambda *_: left_to_right)
     mirrored = ImageCalibration(np.diag([-1.0, -1.0, 1.0]))
     by = DotSettings(), LatticeSettings()
-    found = presenter.detect(np.zeros((8, 8)), 0, by, Control(), mirrored)
-    assert found.correction.lattice.column.tolist() == [2, 1]
     found = presenter.detect(np.zeros((8, 8)), 0, by, Control())
-    assert found.correction.lattice.column.tolist() == [1, 2]
+    assert found.correction(mirrored).lattice.column.tolist() == [2, 1]
+    assert found.correction(None).lattice.column.tolist() == [1, 2]

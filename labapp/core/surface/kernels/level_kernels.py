@@ -8,6 +8,7 @@ from numba import types
 from labapp.core.compiled import BOOLS_1, FLOAT, FLOATS_1, FLOATS_2, FLOATS_3, INT, INTS_1
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
+from labapp.core.surface.kernels.ray_kernels import rise_per_depth
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 _levels = types.Tuple((FLOAT, FLOAT, INT))  # type: ignore[no-untyped-call]
@@ -43,8 +44,8 @@ narrow grid (reach below 1), the second for a wide one."""
 BLUR_WIDTHS = np.geomspace(1 / 200, 1 / 4, 9)
 BLURS = np.array([BLUR_WIDTHS, 1.2 * np.log(BLUR_WIDTHS)])
 
-# Drops: depths of the rear, mm. Half of all rears lie below the work piece; the logarithms of their
-# depths are equally likely.
+# Drops: depths of the rear, mm. Prior: half of all rears lie below the work piece; logarithms of
+# their depths are equally likely.
 DROPS_MM = np.concatenate([[0.0], np.geomspace(0.005, 0.15, 12)])
 SHARE_SUNK = 0.5
 
@@ -346,6 +347,7 @@ def search_level(
     """
     head_sign, laser, (shift, pool_sign, reach, missing, sunk) = search[0], search[1:4], search[4:]
     rises, usual = rises_of(slope, spacing)
+    per_depth = rise_per_depth(slope, landing, laser)
     low, high = np.inf, -np.inf
     for n in range(len(landing)):
         if ray_states[n] > 0:
@@ -366,12 +368,8 @@ def search_level(
     for m in range(len(near)):
         at = near[m]
         share = max((start - head_sign * landing[at, 1]) / (start - end), 0.0)
-        # A ray passes a boundary below the work piece farther from the laser: `height_inside`.
-        rise = 0.0
-        for axis in range(2):
-            rise += slope[at, axis] * (landing[at, axis] - laser[axis]) / laser[2]
         for d in range(len(drops)):
-            over[d, m] = height[0, at] + drops[d] * share * share * (1.0 + rise)
+            over[d, m] = height[0, at] + drops[d] * share * share * per_depth[at]
     count = int(np.rint(STEPS_PER_REACH * reach)) + 1
     first, step = shift - reach * usual, 2.0 * reach * usual / (count - 1)
     levels = first, step, count

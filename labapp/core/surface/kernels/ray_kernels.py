@@ -284,3 +284,22 @@ def behind_torch(points: FloatArray, rays: FloatArray, slopes: FloatArray, tip: 
         # Both ways lead towards y = 0 and up.
         hidden[k] = points[k, 2] - points[k, 1] * z / y > tip - TIP_MARGIN_MM
     return hidden
+
+
+@_compiled(FLOATS_2, FLOATS_2, FLOATS_1)
+def rise_per_depth(slope: FloatArray, landing: FloatArray, laser: FloatArray) -> FloatArray:
+    """By how much m rays pass higher over a boundary that lies lower by 1, shape (m,).
+
+    At the depth of the boundary a ray is farther from the laser than where it lands on z = 0. If
+    the surface is lower there, the ray may meet the wall beyond the boundary. If it is higher, the
+    ray comes across the work piece, and all that lands outside the boundary meets that first.
+
+    Parameters are the gradients at the landing points, the landing points, and the laser, mm.
+    """
+    made = np.ones(len(landing))
+    for n in range(len(landing)):
+        rise = 0.0
+        for axis in range(2):
+            rise += slope[n, axis] * (landing[n, axis] - laser[axis]) / laser[2]
+        made[n] += min(rise, 0.0)
+    return made

@@ -94,16 +94,13 @@ class FrameReader(QObject):
         if not presenter.needs_dots(session, frame):
             return
         by = session.settings.dots, session.settings.lattice
-        calibration = None if session.setup_problems else session.setup.calibration
 
         def done(found: DetectedDots) -> None:
             self.found = found
             self.ready.emit()
 
         self._task = self._space.tasks.start(
-            "Looking for dots",
-            lambda control: presenter.detect(image, frame, by, control, calibration),
-            done,
+            "Looking for dots", lambda control: presenter.detect(image, frame, by, control), done
         )
 
 

@@ -41,10 +41,21 @@ class DetectedDots:
     frame: int
     by: tuple[DotSettings, LatticeSettings]
     """Settings of the detection."""
-    correction: Correction
-    """Dots and rows as the start of a correction."""
+    dots: Dots | None
+    lattice: Lattice | None
+    """Rows and columns in the picture."""
     why: str
     """What could not be found, one sentence; empty if all was."""
+
+    def correction(self, calibration: ImageCalibration | None) -> Correction:
+        """Dots and rows as the start of a correction.
+
+        With a calibration they are numbered as on the imaging plane, otherwise as in the picture.
+        """
+        lattice = self.lattice
+        if calibration is not None and lattice is not None and self.dots is not None:
+            lattice = number_on_plane(lattice, self.dots, calibration)
+        return start_correction(Measurement("", "", "fit", self.dots, lattice))
 
 
 @dataclass(frozen=True)
@@ -105,7 +116,8 @@ def shown(session: Session, frame: int, found: DetectedDots | None) -> DotsState
         start = start_correction(measurement)
         return DotsState(frame, "measured", start, computed, result, measurement.reason)
     if found is not None and (found.frame, found.by) == (frame, by):
-        return DotsState(frame, "found", found.correction, computed, result, damage or found.why)
+        start = found.correction(None if session.setup_problems else session.setup.calibration)
+        return DotsState(frame, "found", start, computed, result, damage or found.why)
     return DotsState(frame, "looked for", None, NO_PLACES, result, damage)
 
 
@@ -138,16 +150,9 @@ def _automatic(result: Result, by: tuple[DotSettings, LatticeSettings]) -> bool:
 
 
 def detect(
-    image: Image,
-    frame: int,
-    by: tuple[DotSettings, LatticeSettings],
-    control: Control,
-    calibration: ImageCalibration | None = None,
+    image: Image, frame: int, by: tuple[DotSettings, LatticeSettings], control: Control
 ) -> DetectedDots:
-    """Detect dots and rows in a frame without measuring it.
-
-    With a calibration they are numbered as on the imaging plane, otherwise as in the picture.
-    """
+    """Detect dots and rows in a frame without measuring it."""
     dots: Dots | None = None
     lattice: Lattice | None = None
     why = ""
@@ -155,12 +160,9 @@ def detect(
         dots = find_dots(image, by[0])
         control.check()
         lattice = find_lattice(dots, (image.shape[0], image.shape[1]), by[1])
-        if calibration is not None:
-            lattice = number_on_plane(lattice, dots, calibration)
     except CannotMeasure as answer:
         why = answer.reason
-    start = start_correction(Measurement("", "", "fit", dots, lattice))
-    return DetectedDots(frame, by, start, why)
+    return DetectedDots(frame, by, dots, lattice, why)
 
 
 def computed_px(result: Result | None) -> FloatArray:
