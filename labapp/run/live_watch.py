@@ -47,8 +47,9 @@ class LiveWatch:
     setup, settings, bit_depth
         As for `LiveMeasuring`.
     on_event
-        Called when an alarm is raised, over, or acknowledged, and when limits change, with the
-        event and the time of its frame by the camera's clock, s (None: now); from any thread.
+        Called when an alarm is raised, over, or acknowledged, when limits or the set-up change, and
+        when measuring ends because of an error, with the event and the time of its frame by the
+        camera's clock, s (None: now); from any thread.
     """
 
     def __init__(

@@ -211,10 +211,11 @@ def _largest_part(kinds: IntArray, kinds_along: IntArray) -> BoolArray:
 
 @compiled(_dots, _places)
 def without_jumps(dots_px: ComplexArray, places: ComplexArray) -> BoolArray:
-    """Find the largest part of a grid without wrong steps.
+    """Cut a grid at wrong steps, and find its largest part.
 
     A grid that jumps over a row, for example at a gap between parts of a pattern, has dots between
-    its rows, or steps aside at the end of the jump.
+    its rows, or steps aside at the end of the jump. Wrong steps within a part that is connected
+    otherwise do not cut it.
 
     Parameters
     ----------

@@ -24,11 +24,14 @@ _NEXT: tuple[Site, ...] = ((0, 1), (0, -1), (1, 0), (-1, 0))
 class Lattice(ReadOnlyArrays):
     """The reflected row and column of each dot.
 
+    They are counted in the picture, upwards and to the right, until `number_on_plane` or a match
+    counts them along Z′ and X′ of the imaging plane.
+
     Parameters
     ----------
     row, column
-        Reflected row k (from the bottom up) and column t (from left to right) of each dot, both
-        counted from 1, shape (n,) for n dots; 0 for dots in doubt, which have none.
+        Reflected row k and column t of each dot, both counted from 1, shape (n,) for n dots; 0 for
+        dots in doubt, which have none.
     reference
         Site (k, t) of the marker's hole: the reference's, unless the centre ray exists. None if it
         is ambiguous or unknown.

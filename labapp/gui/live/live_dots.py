@@ -45,13 +45,15 @@ class _Light:
 
 
 class LiveDots:
-    """Finds dots quickly, and assesses frames. Call each method from one thread.
+    """Finds dots quickly, and assesses frames.
+
+    A method must always be called from the same thread.
 
     Attributes
     ----------
     settings
-        The detector. None: the frames show lines, whose exposure is not assessed. Another thread
-        may replace it.
+        The detector. None: the frames show lines, of which only the exposure is assessed. Another
+        thread may replace it.
     """
 
     def __init__(self, settings: DotSettings | None) -> None:
