@@ -214,6 +214,23 @@ def test_failed_measuring_is_an_alarm_and_is_streamed(
     assert watch.newest() is not None
 
 
+def test_ended_measuring_is_reported_before_its_process_is_awaited(
+    watch: LiveWatch, events: Events, monkeypatch: pytest.MonkeyPatch
+):
+    """A set-up that is changed meanwhile is not followed by the report."""
+
+    def killed(*_: object) -> LiveResult:
+        raise LiveMeasuringEnded("the process was killed")
+
+    reported = []
+    prepared = prepare(watch, {})
+    monkeypatch.setattr(prepared, "measure", killed)
+    monkeypatch.setattr(prepared, "close", lambda: reported.extend(events))
+    watch.measure(frame(1))
+    assert reported == events
+    assert len(reported) > 0
+
+
 def test_fault_in_a_sink_is_reported_and_lasts_until_the_next_setup(
     watch: LiveWatch, events: Events, setup: Setup, monkeypatch: pytest.MonkeyPatch
 ):

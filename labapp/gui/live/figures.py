@@ -154,7 +154,7 @@ class LiveFigures(FollowsTheme, QWidget):
         super().__init__()
         self._grid = QGridLayout()
         self._grid.setColumnStretch(1, 1)
-        self.words, self.setup_words = Message(3), Message(3)
+        self.words, self.setup_words = Message(3), Message(4)
         vbox(self._grid, self.words, self.setup_words, of=self)
         self._labels: dict[tuple[int, int], QLabel] = {}
         self._looks: dict[QLabel, tuple[Look, bool]] = {}

@@ -408,8 +408,8 @@ class LiveView(QObject):
                 stopped = live.watch.stopped
                 self.figures.words.setText(f"▲ {stopped}" if stopped else words)
                 words = live_setup_words(self._result, live.setup.check_date)
-                doubts = self.camera_fields.part_words.text(), words
-                self.figures.setup_words.setText("\n".join(filter(None, doubts)))
+                words += f"\n{self.camera_fields.part_words.text()}"
+                self.figures.setup_words.setText(words.strip())
             self.canvas.show_status(live.watch)
         frame_byte = self.picture.frame_byte
         if live.feed is not None and frame_byte is not None:

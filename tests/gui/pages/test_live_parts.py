@@ -426,11 +426,15 @@ def test_surface_of_a_former_setup_disappears_at_once(
     qtbot.waitUntil(lambda: surface_view.scene is not None)
 
 
-def test_frames_unlike_the_calibration_are_marked_beside_the_sizes(page: CapturePage, qtbot: QtBot):
+def test_frames_unlike_the_calibration_are_marked_beside_the_sizes(
+    page: CapturePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(live_view, "live_setup_words", lambda *_: "set-up doubtful")
     start(page, qtbot)
     view = page.live_view
     view.camera_fields.fields["region"].edited.emit("0, 8, 64, 32")
     qtbot.waitUntil(lambda: PART_WORDS in view.figures.setup_words.text())
+    assert "set-up doubtful" in view.figures.setup_words.text()
     view.camera_fields.whole_button.click()
     qtbot.waitUntil(lambda: PART_WORDS not in view.figures.setup_words.text())
 
