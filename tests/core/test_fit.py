@@ -282,13 +282,34 @@ def test_sizes_have_uncertainties_where_last_rows_are_hidden() -> None:
 
 def test_setup_part_is_that_of_the_nearest_sizes_within_10_percent() -> None:
     sizes = np.array([6.0, 7.0, 0.3, -0.01, 30.0, 5.0])
-    parts = tuple(fit.SetupPart(np.full(6, factor), factor * sizes) for factor in (1.0, 1.08, 1.3))
+    parts = tuple(fit.SetupPart(np.full(9, factor), factor * sizes) for factor in (1.0, 1.08, 1.3))
     assert fit.nearest_part((), sizes) is None
-    for factor, expected in ((1.0, 1.0), (1.05, 1.08), (1.25, 1.3)):
-        part = fit.nearest_part(parts, factor * sizes)
-        assert part is not None
-        assert part.sigma[0] == expected
+    for factor, expected in ((1.0, 0), (1.05, 1), (1.25, 2)):
+        assert fit.nearest_part(parts, factor * sizes) == expected
     assert fit.nearest_part(parts, 0.85 * sizes) is None
     depth = np.eye(6)[3]  # depth is compared on the scale of the height
-    assert fit.nearest_part(parts[:1], sizes - 0.02 * depth) is parts[0]
+    assert fit.nearest_part(parts[:1], sizes - 0.02 * depth) == 0
     assert fit.nearest_part(parts[:1], sizes - 0.04 * depth) is None
+
+
+def test_setup_part_becomes_the_mean_variance_of_ever_rarer_frames() -> None:
+    sizes, other = np.full(6, 2.0), np.full(6, 3.0)
+    computed = [np.array([one, *np.ones(8)]) for one in (1.0, 3.0, 2.0)]
+    computed[1][3], computed[2][4] = np.nan, np.nan
+    parts = fit.parts_after((), computed[0], sizes)
+    parts = fit.parts_after(parts, computed[0], other)
+    gaps = []
+    for fresh in computed[1:]:
+        gap = 0
+        while not parts[0].is_due:
+            gap += 1
+            parts = fit.parts_after(parts, parts[0].sigma, sizes)
+        gaps.append(gap)
+        parts = fit.parts_after(parts, parts[0].sigma_with(fresh), sizes)
+    assert gaps == [fit.SETUP_EVERY, 2 * fit.SETUP_EVERY]
+    np.testing.assert_allclose(parts[0].sigma, [np.sqrt(14 / 3), *np.ones(8)])
+    assert (parts[0].averaged, parts[0].used) == (3, 0)
+    assert (parts[1].averaged, parts[1].used) == (1, 0)  # for other sizes
+    for _ in range(2 * fit.MOST_AVERAGED):
+        parts = fit.parts_after((replace(parts[0], used=10**6),), np.ones(9), sizes)
+    assert parts[0].averaged == fit.MOST_AVERAGED

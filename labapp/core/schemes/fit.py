@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,11 @@ CHANGED = 0.1
 """The set-up's part of the uncertainty is recomputed if a size differs by more than this share from
 those for which it was computed."""
 
+SETUP_EVERY, MOST_AVERAGED = 16, 8
+"""It is computed again after so many frames for each frame over which it is averaged, and the
+largest number of these. It depends on few rays, in steps, and varies by a third from frame to
+frame."""
+
 
 @dataclass(frozen=True)
 class SetupPart(ReadOnlyArrays):
@@ -38,14 +43,36 @@ class SetupPart(ReadOnlyArrays):
         Standard uncertainty of each of `measures.WITH_SIGMA`, shape (9,).
     sizes
         The sizes, shape (6,), mm, mm², mm³.
+    averaged
+        Number of frames over which the variance is averaged.
+    used
+        Number of frames that have used it since it was last computed.
     """
 
     sigma: FloatArray
     sizes: FloatArray
+    averaged: int = 1
+    used: int = 0
+
+    @property
+    def is_due(self) -> bool:
+        """Whether it is computed again for the next frame of such sizes."""
+        return self.used >= SETUP_EVERY * self.averaged
+
+    def sigma_with(self, sigma: FloatArray) -> FloatArray:
+        """Average the variance with that of one more frame; return its root, shape (9,)."""
+        both = np.sqrt((self.averaged * self.sigma**2 + sigma**2) / (self.averaged + 1))
+        return np.where(np.isnan(both), np.fmax(self.sigma, sigma), both)
+
+    def after(self, sigma: FloatArray) -> SetupPart:
+        """Return the part after a frame, with the uncertainty that was used for it."""
+        if not self.is_due:
+            return replace(self, used=self.used + 1)
+        return replace(self, sigma=sigma, averaged=min(self.averaged + 1, MOST_AVERAGED), used=0)
 
 
-def nearest_part(parts: tuple[SetupPart, ...], sizes: FloatArray) -> SetupPart | None:
-    """The part with the nearest sizes, shape (6,); None if all differ by more than `CHANGED`.
+def nearest_part(parts: tuple[SetupPart, ...], sizes: FloatArray) -> int | None:
+    """Index of the part with the nearest sizes, shape (6,); None if all differ by over `CHANGED`.
 
     Compared is the largest relative change of a size; height and depth have a common scale.
     """
@@ -56,7 +83,17 @@ def nearest_part(parts: tuple[SetupPart, ...], sizes: FloatArray) -> SetupPart |
     scale[:, 2:4] = scale[:, 2:4].max(axis=1, keepdims=True)
     change = (np.abs(sizes - known) / scale).max(axis=1)
     nearest = int(np.argmin(change))
-    return parts[nearest] if change[nearest] <= CHANGED else None
+    return nearest if change[nearest] <= CHANGED else None
+
+
+def parts_after(
+    parts: tuple[SetupPart, ...], sigma: FloatArray, sizes: FloatArray
+) -> tuple[SetupPart, ...]:
+    """Return the parts after a frame with such sizes, and the set-up's part used for it."""
+    nearest = nearest_part(parts, sizes)
+    if nearest is None:
+        return *parts, SetupPart(sigma, sizes)
+    return *parts[:nearest], parts[nearest].after(sigma), *parts[nearest + 1 :]
 
 
 @dataclass(frozen=True)
@@ -121,7 +158,7 @@ def bound_and_measure(
     """Compute the boundary, the sizes and all uncertainties of a fitted surface.
 
     With the results for a previous frame the boundary is traced from the former one, and the part
-    of the set-up is recomputed only if a size has changed (`CHANGED`).
+    of the set-up is computed only if a size has changed (`CHANGED`), or if it is due.
 
     Raises
     ------
@@ -147,11 +184,15 @@ def bound_and_measure(
     gradient, by_drop = by_all[:, :-1], by_all[:, -1]
     # The splines add up to 1: the sum is the derivative by the shift.
     level_sigma = level.sigma_of(gradient.sum(axis=1), by_drop)
-    former = None if previous is None else nearest_part(previous.setup_parts, sizes.values)
-    if former is not None:
+    parts = () if previous is None else previous.setup_parts
+    nearest = nearest_part(parts, sizes.values)
+    former = None if nearest is None else parts[nearest]
+    if former is not None and not former.is_due:
         sigma_of_setup = former.sigma
     else:
         sigma_of_setup = setup_sigma(setup_changes(match, rig, settings, pool, by_all))
+        if former is not None:
+            sigma_of_setup = former.sigma_with(sigma_of_setup)
     reconstruction = Reconstruction(
         scheme="fit",
         surface=pool.surface,

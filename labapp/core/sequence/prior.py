@@ -13,7 +13,7 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.images.band_pass import DetectorTuning
 from labapp.core.match import Match
 from labapp.core.matching.prediction import RayPaths
-from labapp.core.schemes.fit import UNSETTLED_MM, FromPrevious, SetupPart, nearest_part
+from labapp.core.schemes.fit import UNSETTLED_MM, FromPrevious, SetupPart, parts_after
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.level import Level
 from labapp.core.surface.measures import Measures
@@ -33,9 +33,8 @@ RIDGE = 1e-4
 MOST_ROUNDS, SETTLED_MM = 8, 3e-4
 """Maximum number of rounds of a fit that starts from a close surface, and its convergence limit."""
 
-SETUP_EVERY, DROP_EVERY = 128, 16
-"""Intervals in frames after which the part of the set-up in the uncertainty of the sizes, and the
-drop of the rear, are recomputed."""
+DROP_EVERY = 16
+"""Interval in frames after which the drop of the rear is fitted again."""
 
 
 @dataclass(frozen=True)
@@ -134,9 +133,7 @@ class Prior:
 
     def after(self, tracked: Tracked, reconstruction: Reconstruction, measures: Measures) -> Prior:
         """Build the prior for the frame after one that was tracked with this one."""
-        setup_parts, sizes = () if self.setup_is_due else self.setup_parts, measures.sizes
-        if nearest_part(setup_parts, sizes) is None:  # it was computed for these sizes
-            setup_parts = *setup_parts, SetupPart(reconstruction.size_sigma_setup, sizes)
+        of_setup = reconstruction.size_sigma_setup
         paths, lit, pool = tracked.paths, tracked.lit, tracked.pool
         return replace(
             self,
@@ -147,7 +144,7 @@ class Prior:
             past=np.vstack([self.past[1 - MEMORY :], paths.coefficients]),
             slopes=np.concatenate([self.slopes[1 - MEMORY :], paths.slopes[None]]),
             level_sigma_mm=pool.level.sigma_mm if self.drop_is_free else self.level_sigma_mm,
-            setup_parts=setup_parts,
+            setup_parts=parts_after(self.setup_parts, of_setup, measures.sizes),
             unseen=0 if tracked.reference_is_seen else self.unseen + 1,
             count=self.count + 1,
         )
@@ -157,14 +154,9 @@ class Prior:
         """Whether the drop of the rear is fitted with the level in the next frame."""
         return self.count % DROP_EVERY == DROP_EVERY - 1
 
-    @property
-    def setup_is_due(self) -> bool:
-        """Whether the part of the set-up is recomputed in the next frame, whatever its sizes."""
-        return self.count % SETUP_EVERY == SETUP_EVERY - 1
-
     def carried_over(self) -> FromPrevious:
-        """Return what `fit.bound_and_measure` takes over; the parts of the set-up only at times."""
-        return FromPrevious(self.boundary, () if self.setup_is_due else self.setup_parts)
+        """Return what `fit.bound_and_measure` takes over."""
+        return FromPrevious(self.boundary, self.setup_parts)
 
     def after_gap(self) -> Prior:
         """Build the prior after a frame that was not measured: only the last surface is kept."""
