@@ -42,12 +42,10 @@ class Rear:
         return np.array([self.drop_mm, self.start_mm, self.end_mm], float)
 
     def height(self, y_mm: FloatArray) -> FloatArray:
-        """Height of the boundary at y, of the shape of ``y_mm``, mm.
+        """Height of the boundary at Y (`spline_kernels.drop_share`), shape as ``y_mm``, mm."""
+        from labapp.core.surface.kernels import spline_kernels
 
-        It is 0 up to the start and decreases as a parabola towards the end, on whichever side.
-        """
-        share = np.maximum((self.start_mm - y_mm) / (self.start_mm - self.end_mm), 0.0)
-        return -self.drop_mm * share**2
+        return spline_kernels.rear_heights(self.as_array, y_mm.ravel()).reshape(y_mm.shape)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from labapp.core.compiled import compiled as _compiled
 from labapp.core.surface.kernels.spline_kernels import (
     accumulate_at_boundary,
     accumulate_splines,
+    drop_share,
     height_and_slopes,
 )
 from labapp.core.values import FloatArray
@@ -58,10 +59,10 @@ def newton_to_boundary(
         for k in range(count):
             x, y = center[0] + out[k] * way[k, 0], center[1] + out[k] * way[k, 1]
             z, slope_x, slope_y = height_and_slopes(grid, coefficients, x, y, work)
-            part = max((rear[1] - y) / (rear[1] - rear[2]), 0.0)
-            over[k] = z + rear[0] * part * part
+            share, share_slope = drop_share(rear, y)
+            over[k] = z + rear[0] * share
             boundary_slope[k, 0] = slope_x
-            boundary_slope[k, 1] = slope_y - 2.0 * rear[0] * part / (rear[1] - rear[2])
+            boundary_slope[k, 1] = slope_y + rear[0] * share_slope
             outward = boundary_slope[k, 0] * way[k, 0] + boundary_slope[k, 1] * way[k, 1]
             change = -over[k] / outward if abs(outward) > 1e-6 else 0.0
             out[k] += min(max(change, -longest[k]), longest[k])
@@ -117,9 +118,8 @@ def spokes(
             x = center[0] + fraction[ring] * (end[0] - center[0])
             y = center[1] + fraction[ring] * (end[1] - center[1])
             z, _, _ = height_and_slopes(grid, coefficients, x, y, work)
-            part = max((rear[1] - y) / (rear[1] - rear[2]), 0.0)
             samples[at, 0], samples[at, 1], samples[at, 2] = x, y, z
-            over[at] = z + rear[0] * part * part
+            over[at] = z + rear[0] * drop_share(rear, y)[0]
             share[at] = own * weight[ring] * fraction[ring]
     return samples, over, share
 

@@ -9,6 +9,7 @@ from labapp.core.compiled import BOOLS_1, FLOAT, FLOATS_1, FLOATS_2, FLOATS_3, I
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
 from labapp.core.surface.kernels.ray_kernels import rise_per_depth
+from labapp.core.surface.kernels.spline_kernels import drop_share
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 _levels = types.Tuple((FLOAT, FLOAT, INT))  # type: ignore[no-untyped-call]
@@ -354,6 +355,7 @@ def search_level(
             low, high = min(low, head_sign * landing[n, 1]), max(high, head_sign * landing[n, 1])
     start = (low + high) / 2.0
     end = min(low, start - 1e-6)  # a single row has no rear
+    rear = np.array([0.0, head_sign * start, head_sign * end])
     near = np.flatnonzero(np.abs(height[0] + shift) < NEAR_RISES * rises)
     signed_sharpness, dark, spread = (
         np.empty(len(near)),
@@ -367,9 +369,9 @@ def search_level(
     over = np.empty((len(drops), len(near)))
     for m in range(len(near)):
         at = near[m]
-        share = max((start - head_sign * landing[at, 1]) / (start - end), 0.0)
+        lower = drop_share(rear, landing[at, 1])[0] * per_depth[at]
         for d in range(len(drops)):
-            over[d, m] = height[0, at] + drops[d] * share * share * per_depth[at]
+            over[d, m] = height[0, at] + drops[d] * lower
     count = int(np.rint(STEPS_PER_REACH * reach)) + 1
     first, step = shift - reach * usual, 2.0 * reach * usual / (count - 1)
     levels = first, step, count
@@ -379,9 +381,9 @@ def search_level(
     mean, sigma, drop, drop_sigma, covariance, at_ends = level_posterior(
         nats, blurs[1], sunk, drops, first, step
     )
-    level, rear = (mean, sigma, pool_sign), (drop, head_sign * start, head_sign * end)
+    rear[0] = drop
     seen = nats.min(), float(len(near)), usual
-    return np.array([*level, *rear, *seen, drop_sigma, covariance]), at_ends
+    return np.array([mean, sigma, pool_sign, *rear, *seen, drop_sigma, covariance]), at_ends
 
 
 @_compiled(FLOATS_2, FLOATS_2, FLOATS_2, INTS_1, FLOATS_1, FLOATS_1, FLOATS_1, FLOAT)

@@ -80,6 +80,26 @@ def accumulate_splines(
 
 
 @_inner
+def drop_share(rear: FloatArray, y: float) -> tuple[float, float]:
+    """Share of the rear's drop by which the boundary lies lower at Y, and its derivative by Y.
+
+    It is 0 up to the start and increases as a parabola to 1 at the end, on whichever side.
+    """
+    per_mm = 1.0 / (rear[1] - rear[2])
+    part = max((rear[1] - y) * per_mm, 0.0)
+    return part * part, -2.0 * part * per_mm
+
+
+@_compiled(FLOATS_1, FLOATS_1)
+def rear_heights(rear: FloatArray, y: FloatArray) -> FloatArray:
+    """Heights of the boundary at places Y (`level.Rear.height`), shape (n,), mm."""
+    height = np.empty(len(y))
+    for k in range(len(y)):
+        height[k] = -rear[0] * drop_share(rear, y[k])[0]
+    return height
+
+
+@_inner
 def accumulate_at_boundary(
     grid: FloatArray,
     rear: FloatArray,
@@ -92,13 +112,12 @@ def accumulate_at_boundary(
     """`accumulate_splines` at a boundary point, and for the drop of the rear.
 
     Where the boundary lies lower by dz it moves as if the surface were higher by dz. The derivative
-    by the drop (`Rear.height`) is the last value of ``out``.
+    by the drop is the last value of ``out``.
     """
     if share == 0.0:  # what moves with the boundary's height is 0 except at a rear that lies lower
         return
     accumulate_splines(grid, x, y, share, work, out)
-    part = max((rear[1] - y) / (rear[1] - rear[2]), 0.0)
-    out[-1] += share * part * part
+    out[-1] += share * drop_share(rear, y)[0]
 
 
 @_compiled(FLOATS_2, INT, FLOATS_2, FLOATS_1)
