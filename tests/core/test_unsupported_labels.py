@@ -98,7 +98,7 @@ def test_label_between_two_free_dots_is_not_supported_unless_its_row_is_hidden()
     assert left_out(replace(observed, hidden_rows=frozenset({10})), fewer) == []
 
 
-def test_wide_dot_beside_a_missing_one_may_be_both() -> None:
+def test_wide_dot_beside_a_missing_one_may_be_both_unless_its_row_is_hidden() -> None:
     observed, labels = scene()
     dot, size = inner_dot(labels), np.full(len(observed.plane_mm), 2.0)
     size[dot] *= 1.4
@@ -106,6 +106,7 @@ def test_wide_dot_beside_a_missing_one_may_be_both() -> None:
     fewer[9, 12] = UNLABELLED
     assert left_out(wide, labels) == []
     assert left_out(wide, fewer) == [dot]
+    assert left_out(replace(wide, hidden_rows=frozenset({10})), fewer) == []
 
 
 def test_false_dot_of_a_ray_outside_the_boundary_gets_no_ray() -> None:

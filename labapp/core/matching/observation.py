@@ -127,9 +127,9 @@ class Observation(ReadOnlyArrays):
         return self.bench.frame_area_mm2(self.frame_shape)
 
     @cached_property
-    def hidden(self) -> BoolArray:
-        """Rays of `hidden_rows`, shape (rows, columns)."""
-        mask = np.zeros(self.rays.absent.shape, bool)
+    def without_dot(self) -> BoolArray:
+        """Rays known to have no dot, absent ones and those of `hidden_rows`: (rows, columns)."""
+        mask = self.rays.absent.copy()
         mask[[i - 1 for i in self.hidden_rows if 1 <= i <= len(mask)]] = True
         mask.flags.writeable = False
         return mask

@@ -49,7 +49,7 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
 
     ray_states, missed, stray = match_kernels.classify_rays(
         labels,
-        observed.rays.absent | observed.hidden,
+        observed.without_dot,
         (paths.points_mm, paths.slopes, paths.plane_mm),
         observed.rays.directions.reshape(-1, 3),
         observed.plane_mm,

@@ -162,7 +162,7 @@ def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:
     times = size / match_kernels.medians_around(size)
     wide = times > WIDE
     for ray in np.flatnonzero(~wide & (times > WIDE_BESIDE)):
-        dark_mm = plane_mm[(~lit & ~observed.rays.absent).ravel()]
+        dark_mm = plane_mm[~(lit | observed.without_dot).ravel()]
         apart_mm = np.linalg.norm(dark_mm - plane_mm[ray], axis=-1)
         wide.flat[ray] = (apart_mm < BESIDE_RESOLUTIONS * observed.resolution_mm).any()
     return wide
@@ -178,8 +178,7 @@ def _beside_free_dots(observed: Observation, labels: IntArray) -> BoolArray:
     from labapp.core.images import band_pass_kernels
 
     lit = labels != UNLABELLED
-    no_dot = observed.rays.absent | observed.hidden
-    dark = np.pad(amid(lit) & ~lit & ~no_dot, 1).astype(np.int64)
+    dark = np.pad(amid(lit) & ~(lit | observed.without_dot), 1).astype(np.int64)
     adjacent = dark[:-2, 1:-1] + dark[2:, 1:-1] + dark[1:-1, :-2] + dark[1:-1, 2:]
     beside: BoolArray = lit & (adjacent > 1)
     if beside.any():
