@@ -26,7 +26,7 @@ from labapp.run.limits import Limits
 from labapp.run.live_measuring import LiveMeasuring, LiveMeasuringEnded, LiveResult
 from labapp.run.live_queue import FrameQueue
 from labapp.run.live_trend import LiveTrend
-from labapp.run.streams import Stream, stream_values
+from labapp.run.streams import Stream, Values, stream_values
 
 if TYPE_CHECKING:
     from labapp.export.penetration import Predictor
@@ -75,8 +75,12 @@ class LiveWatch:
         self._turn, self._handing_on = threading.Lock(), threading.Lock()
         self._streams: dict[str, Stream] = {}
         self._is_closed = False
-        self._measured_s, self._last = time.monotonic(), (0, 0.0)
-        """Time of the last result; number and time of its frame, s by the camera's clock."""
+        self._measured_s = time.monotonic()
+        """Time of the last result."""
+        self._last: tuple[int, float] | None = None
+        """Number and time of its frame, s by the camera's clock; None before the first."""
+        self.stream_faults: dict[str, str] = {}
+        """Kinds of the streams that were closed because of a fault, and the fault."""
         self._scene_is_due = threading.Event()
         self.predictor: Predictor | None = None
         """Predictor of penetration; may be replaced at any time."""
@@ -177,16 +181,34 @@ class LiveWatch:
         self._publish_silence(words)
 
     def _publish_silence(self, reason: str) -> None:
-        self._publish(FrameResult(*self._last, Measurement("silent", reason, self._scheme)))
+        frame, time_s = self._last or (0, None)
+        silence = FrameResult(frame, time_s, Measurement("silent", reason, self._scheme))
+        values = stream_values(silence, self.alarms.shown)
+        self._send(values if self._last else {**values, "frame": None})
 
-    def _publish(self, result: FrameResult) -> None:
-        values = stream_values(result, self.alarms.shown)
+    def _publish(self, result: LiveResult) -> None:
         predictor = self.predictor
-        if predictor is not None and isinstance(result, LiveResult):  # not from `_publish_silence`
-            values = {**values, **predictor.values()}
+        predicted = {} if predictor is None else predictor.values()
+        self._send({**stream_values(result, self.alarms.shown), **predicted})
+
+    def _send(self, values: Values) -> None:
+        """Send values by all streams; a faulty one is closed, and this is reported."""
+        closed: list[Stream] = []
         with self._turn:  # no stream may be closed during this
-            for stream in self._streams.values():
-                stream.publish(values)
+            for kind, stream in list(self._streams.items()):
+                try:
+                    stream.publish(values)
+                except Exception as error:  # measuring and the other streams continue
+                    logging.getLogger(NAME).error("stream %s", kind, exc_info=error)
+                    self.stream_faults[kind] = (
+                        f"a fault in the program: {error!r}; details are in the log"
+                    )
+                    closed.append(self._streams.pop(kind))
+        for stream in closed:
+            words = f"the stream at {stream.address} is closed because of a fault: see the log"
+            self._on_event(Event(self._name, "warning", words), None)
+            # It may wait for its clients, or not end at all.
+            threading.Thread(target=stream.close, name="stream ends", daemon=True).start()
 
     # --- results ------------------------------------------------------------------------------
 
@@ -262,6 +284,7 @@ class LiveWatch:
         """Replace the stream of a kind, which is closed; None: only close it."""
         with self._turn:
             former = self._streams.pop(kind, None)
+            self.stream_faults.pop(kind, None)
             if stream is not None and not self._is_closed:
                 self._streams[kind], stream = stream, None
         for each in (former, stream):

@@ -281,8 +281,9 @@ class OpcuaStream:
             values, self._newest = self._newest, None
             try:
                 # What a frame lacks is unknown, and must not remain from a former one.
-                for name, value in ({**self._unknown, **values} if values else {}).items():
-                    await self._variables[name].write_value(math.nan if value is None else value)
+                known = {k: v for k, v in (values or {}).items() if v is not None}
+                for name, value in ({**self._unknown, **known} if values else {}).items():
+                    await self._variables[name].write_value(value)
                 self.sent += values is not None and self.listeners > 0
             except Exception as error:  # one frame must not end the stream
                 logging.getLogger(NAME).error("not sent by OPC UA", exc_info=error)

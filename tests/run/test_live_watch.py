@@ -279,6 +279,61 @@ def test_streams_say_at_once_that_sizes_of_a_former_setup_do_not_hold(
     assert watch.stream("lines") is stream
 
 
+def test_nothing_is_said_of_a_frame_before_the_first_result(watch: LiveWatch, setup: Setup):
+    stream = LineStream()
+    watch.set_stream("lines", stream)
+    with connect(stream.port) as connection:
+        lines = connection.makefile(encoding="utf-8")
+        lines.readline()
+        watch.set_setup(setup, Settings())
+        watch.measure(frame(4))
+        watch.set_setup(setup, Settings())
+        values = [json.loads(lines.readline()) for _ in range(3)]
+    assert [each["status"] for each in values] == ["silent", "ok", "silent"]
+    assert [each["frame"] for each in values] == [None, 4, 4]
+    assert [each["time_s"] for each in values] == [None, 14.0, 14.0]
+
+
+class Faulty:
+    """A stream that cannot send, and does not end."""
+
+    address, sent, listeners = "nowhere:1", 0, 0
+
+    def __init__(self) -> None:
+        self.gate, self.closed = threading.Event(), threading.Event()
+
+    def publish(self, _: object) -> None:
+        raise RuntimeError("the loop is closed")
+
+    def close(self) -> None:
+        self.gate.wait(PATIENCE_S)
+        self.closed.set()
+
+
+def test_faulty_stream_is_closed_and_reported_while_measuring_continues(
+    watch: LiveWatch, events: Events
+):
+    faulty, stream = Faulty(), LineStream()
+    watch.set_stream("opcua", faulty)
+    watch.set_stream("lines", stream)
+    with connect(stream.port) as connection:
+        lines = connection.makefile(encoding="utf-8")
+        lines.readline()
+        for number in (1, 2):
+            watch.measure(frame(number))
+        assert [json.loads(lines.readline())["frame"] for _ in range(2)] == [1, 2]
+    assert watch.stopped == ""
+    assert (watch.stream("opcua"), watch.stream("lines")) == (None, stream)
+    assert [event.kind for event, _ in events] == ["warning"]
+    assert "nowhere:1" in events[0][0].words
+    assert "the loop is closed" in watch.stream_faults["opcua"]
+    assert not faulty.closed.is_set()  # it is not awaited
+    faulty.gate.set()
+    wait_until(faulty.closed.is_set)
+    watch.set_stream("opcua", None)
+    assert watch.stream_faults == {}
+
+
 def test_alarms_ended_by_new_limits_are_reported(watch: LiveWatch, events: Events):
     prepare(watch, {1: 7.2})
     watch.measure(frame(1))

@@ -312,3 +312,26 @@ def test_opc_ua_clients_read_the_newest_frame(port: int, measured: Measurement) 
             assert math.isnan(values[name])
         else:
             assert values[name] == value, name
+
+
+def test_opc_ua_variables_say_what_is_unknown_before_the_first_frame(
+    port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("asyncua")
+    stream = OpcuaStream(port=port)
+    values = stream_values(FrameResult(7, 0.5, DARK))
+    stream.publish(values)
+    wait_until(lambda: stream._newest is None)
+    stream.publish({**values, "frame": None, "time_s": None})
+    wait_until(lambda: stream._newest is None)
+
+    async def read(name: str) -> Any:
+        return await stream._variables[name].read_value()
+
+    try:
+        wait_until(lambda: stream._loop.run(read("frame")) == -1)
+        assert math.isnan(stream._loop.run(read("time_s")))
+        assert stream._loop.run(read("status")) == DARK.status
+    finally:
+        stream.close()
+    assert not caplog.records

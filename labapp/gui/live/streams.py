@@ -148,6 +148,10 @@ class LiveStreams(QWidget):
         watch = self._watch()
         for kind in KINDS:
             stream = None if watch is None else watch.stream(kind)
+            fault = "" if watch is None else watch.stream_faults.pop(kind, "")
+            if fault:
+                self._problems[kind] = fault
+                self.boxes[kind].setChecked(False)
             message = stream_text(stream, self._is_at_work(kind), self._problems.get(kind, ""))
             self.words[kind].setText(message)
         show_words(self.warning, WARNING if self.anywhere.isChecked() else "")

@@ -479,6 +479,33 @@ def test_control_software_stays_connected_when_the_setup_changes(
             assert json.loads(file.readline())["status"] == "ok"
 
 
+def test_stream_with_a_fault_is_switched_off_and_says_why(
+    window: MainWindow,
+    page: CapturePage,
+    qtbot: QtBot,
+    port: int,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    hand, streams = Hand(window), page.live_view.canvas.streams
+    start(page, qtbot)
+    choose(page, "Control software")
+    hand.enter(streams.ports["lines"], str(port))
+    streams.boxes["lines"].click()
+    watch = page.live_view.live.watch
+    qtbot.waitUntil(lambda: watch.stream("lines") is not None)
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+
+    def broken(*_: object) -> None:
+        raise RuntimeError("the loop is closed")
+
+    monkeypatch.setattr(watch.stream("lines"), "publish", broken)
+    qtbot.waitUntil(lambda: "the loop is closed" in streams.words["lines"].text())
+    assert not streams.boxes["lines"].isChecked()
+    assert f"127.0.0.1:{port} is closed" in log_of(window)
+    streams.boxes["lines"].click()
+    qtbot.waitUntil(lambda: streams.words["lines"].text().startswith(f"● 127.0.0.1:{port}"))
+
+
 def test_control_software_receives_results_while_live(
     window: MainWindow, page: CapturePage, qtbot: QtBot, port: int
 ):
