@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open, unconfirmed
+from labapp.core.matching.hidden_rows import refuse_hidden_rows
 from labapp.core.matching.hypothesis import (
     FINE_FIT,
     KNOT_ERROR_MM,
@@ -123,6 +124,7 @@ def decide(
     best = _without(observed, best, doubtful, fit_settings)
     best = supported(observed, best, fit_settings)
     _refuse_hidden_marker(observed, best)
+    refuse_hidden_rows(observed, best, fit_settings)
     freed = holes_left_open(observed, best, fit_settings, settings.margin)
     if freed:
         best = _without(observed, best, unconfirmed(freed[0], best.labels), fit_settings)

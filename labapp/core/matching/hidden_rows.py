@@ -1,0 +1,97 @@
+"""Check that no row or column of dots is hidden between the others.
+
+A wire or the torch in front of the plane may hide all dots of a row. If the rows beyond it are
+labelled as if none were hidden, their rays are one row off, and the surface bends to explain them.
+As one object hides them all, its dots do not count as missed one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from labapp.core.matching.hypothesis import MISSED_COST, Hypothesis, evaluate_averaged
+from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
+from labapp.core.surface.pool_fit import FitSettings
+from labapp.core.values import CannotMeasure, FloatArray, IntArray
+
+WIDE_GAP = 1.45
+"""A row may be hidden in a gap that exceeds by this factor what follows from the two gaps before
+it, whose ratio changes little on a smooth surface."""
+
+AHEAD, FEW, AHEAD_FEW = 11.0, 4, 25.0
+"""Labels must cost less by the first than with a hidden row, whose dots do not count as missed, or
+by the last if at most `FEW` dots are beyond the gap; in units of χ². Right labels with such gaps,
+in dips and ripples, led by 12 or more; of labels one row off, nine in ten led by less, or cost
+more."""
+
+
+def refuse_hidden_rows(observed: Observation, best: Hypothesis, fit_settings: FitSettings) -> None:
+    """Raise ``ambiguous-rows`` if the labels cost less with a row or column hidden between them."""
+    own = evaluate_averaged(observed, best.labels, fit_settings, best.pool)
+    for axis, inner, outer in _wide_gaps(observed, best.labels):
+        labels = _moved_outwards(best.labels, axis, inner, outer)
+        pool = None if labels is None else try_fit(observed, labels, initial=best.pool)
+        if labels is None or pool is None or own is None:
+            continue
+        rival = evaluate_averaged(observed, labels, fit_settings, pool)
+        if rival is None:
+            continue
+        hidden = int(np.count_nonzero(rival.missed_rays[:, axis] == outer))
+        moved = np.count_nonzero((labels != best.labels) & (labels != UNLABELLED))
+        ahead = AHEAD_FEW if moved <= FEW else AHEAD
+        if rival.cost - MISSED_COST * hidden < own.cost + ahead:
+            line = "row" if axis == 0 else "column"
+            raise CannotMeasure(
+                "ambiguous-rows",
+                f"a {line} of dots seems to be hidden next to {line} {inner + 1} of the rays: "
+                f"correct the dots and mark it as blocked",
+            )
+
+
+def _wide_gaps(observed: Observation, labels: IntArray) -> Iterator[tuple[int, int, int]]:
+    """Axis, and the rows (or columns) before and after each gap in which one may be hidden.
+
+    Gaps are followed from the marker outwards; numbers are counted from 0.
+    """
+    marker = observed.rig.pattern.marker
+    assert marker is not None
+    place = np.full((*labels.shape, 2), np.nan)
+    lit = labels != UNLABELLED
+    place[lit] = observed.plane_mm[labels[lit]]
+    for axis, start in enumerate(np.subtract(marker, 1).tolist()):
+        gaps = _gaps(place if axis == 0 else place.transpose(1, 0, 2))
+        for step in (1, -1):
+            along = gaps[::step]
+            first = start if step > 0 else len(gaps) - start
+            for k in range(max(first, 1), len(along)):
+                before = along[k - 1]
+                far = along[k - 2] if k > 1 and np.isfinite(along[k - 2]) else before
+                if along[k] > WIDE_GAP * before * before / far:
+                    inner = k if step > 0 else len(gaps) - k
+                    yield axis, inner, inner + step
+
+
+def _gaps(place: FloatArray) -> FloatArray:
+    """Median distance of the dots of each row from those of the next one, NaN without any."""
+    distance = np.linalg.norm(np.diff(place, axis=0), axis=-1)
+    gaps = np.full(len(distance), np.nan)
+    known = np.isfinite(distance).any(axis=1)
+    gaps[known] = np.nanmedian(distance[known], axis=1)
+    return gaps
+
+
+def _moved_outwards(labels: IntArray, axis: int, inner: int, outer: int) -> IntArray | None:
+    """Labels with all rows (or columns) from ``outer`` on moved by one away from ``inner``.
+
+    None if there is no ray for the last of them.
+    """
+    lines = labels if axis == 0 else labels.T
+    lines, first = (lines, outer) if outer > inner else (lines[::-1], len(lines) - 1 - outer)
+    if (lines[-1] != UNLABELLED).any():
+        return None
+    empty = np.full((1, lines.shape[1]), UNLABELLED)
+    moved = np.concatenate([lines[:first], empty, lines[first:-1]])
+    moved = moved if outer > inner else moved[::-1]
+    return np.ascontiguousarray(moved if axis == 0 else moved.T)
