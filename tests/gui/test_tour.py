@@ -27,7 +27,7 @@ GUI = Path(labapp.__file__).parent / "gui"
 TOUR = (sys.executable, "-m", "tests.tour")
 ROOT = Path(__file__).parents[2]
 SIZE = (1280, 760)
-ASKING = ("getOpenFileName", "getSaveFileName", "getExistingDirectory")
+ASKING = ("ask_file", "ask_folder", "ask_save", "ask_new_session", "setWindowTitle")
 
 
 def environment(home: Path, platform: str) -> dict[str, str]:
@@ -104,39 +104,19 @@ def test_every_menu_has_a_picture(taken: tuple[Path, str, Path]):
 def asked_titles() -> Iterator[str]:
     """The start of the title of each dialog of the app, read from its source."""
     for path in sorted(GUI.rglob("*.py")):
-        tree = ast.parse(path.read_text("utf-8"))
-        for function in ast.walk(tree):
-            if isinstance(function, ast.FunctionDef):
-                yield from _titles_in(function, path)
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call):
+                name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+                if name in ASKING:
+                    yield from itertools.islice(_texts(node.args), 1)
 
 
-def _titles_in(function: ast.FunctionDef, path: Path) -> Iterator[str]:
-    calls = [node for node in ast.walk(function) if isinstance(node, ast.Attribute)]
-    if any(call.attr in ASKING for call in calls):
-        texts = [
-            text.value
-            for text in ast.walk(function)
-            if isinstance(text, ast.Constant) and isinstance(text.value, str)
-        ]
-        titles = [text for text in texts if re.match(r"[A-Z][a-z]+ (?!files)[a-z]", text)]
-        docstring = ast.get_docstring(function, clean=False)
-        titles = [title for title in titles if title != docstring]
-        assert titles, f"{path.name}: {function.name} opens a dialog without a title"
-        yield titles[0]
-    created = [
-        node.func.id
-        for node in ast.walk(function)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
-    ]
-    if "QMessageBox" in created:
-        yield from (
-            call.args[0].value
-            for call in ast.walk(function)
-            if isinstance(call, ast.Call)
-            and isinstance(call.func, ast.Attribute)
-            and call.func.attr == "setWindowTitle"
-            and isinstance(call.args[0], ast.Constant)
-        )
+def _texts(arguments: list[ast.expr]) -> Iterator[str]:
+    """The texts among arguments; of one that is composed, its start."""
+    for argument in arguments:
+        first = argument.values[0] if isinstance(argument, ast.JoinedStr) else argument
+        if isinstance(first, ast.Constant) and isinstance(first.value, str):
+            yield first.value
 
 
 @pytest.mark.soak
