@@ -1,4 +1,4 @@
-"""Frames in which an object hides a whole row of dots between the others."""
+"""Frames in which an object hides a row of dots between the others, or all beyond a line."""
 
 from __future__ import annotations
 
@@ -12,23 +12,34 @@ from labapp.core.images.dots import Dots
 from labapp.core.matching.hidden_rows import refuse_hidden_rows
 from labapp.core.matching.hypothesis import USUAL_FIT, evaluate
 from labapp.core.matching.observation import UNLABELLED, Observation
-from labapp.core.values import CannotMeasure
+from labapp.core.values import BoolArray, CannotMeasure
 from labapp.simulation.pools import egg
 from tests.benchmarks.clutter import draw_pool
 from tests.benchmarks.dips import matched
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see, true_labels
 
 
+def part_of(seen: SeenDots, shown: BoolArray) -> SeenDots:
+    dots = Dots(*(getattr(seen.dots, each.name)[shown] for each in fields(Dots)))
+    return SeenDots(dots, seen.ray[shown])
+
+
 def without(seen: SeenDots, axis: int, line: int) -> SeenDots:
     """Hide a row (axis 0) or column: the n-th that has dots."""
-    keep = seen.ray[:, axis] != np.unique(seen.ray[:, axis])[line]
-    dots = Dots(*(getattr(seen.dots, each.name)[keep] for each in fields(Dots)))
-    return SeenDots(dots, seen.ray[keep])
+    return part_of(seen, seen.ray[:, axis] != np.unique(seen.ray[:, axis])[line])
 
 
 @pytest.mark.parametrize(
     ("kind", "seed"),
-    [("egg", 0), ("egg", 2), ("egg", 4), ("egg", 6), ("ellipse", 4), ("ellipse", 7), ("rippled", 5)],
+    [
+        ("egg", 0),
+        ("egg", 2),
+        ("egg", 4),
+        ("egg", 6),
+        ("ellipse", 4),
+        ("ellipse", 7),
+        ("rippled", 5),
+    ],
 )
 def test_row_beyond_a_hidden_one_gets_no_wrong_rays(kind: str, seed: int) -> None:
     """Each was once measured with its last row one off, and too short by up to 13 σ."""
@@ -40,12 +51,13 @@ def test_row_beyond_a_hidden_one_gets_no_wrong_rays(kind: str, seed: int) -> Non
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("egg", 2), ("cap", 3), ("ellipse", 5)])
-def test_dots_before_a_hidden_row_at_the_head_keep_their_rays(kind: str, seed: int) -> None:
+def test_pool_with_a_hidden_row_at_the_head_is_not_measured(kind: str, seed: int) -> None:
+    """Each was once measured 17 to 21 % too low: rays of the hidden row seemed to miss the pool."""
     rig, pool = draw_pool(kind, np.random.default_rng([seed, 3]))
     seen = without(see(pool, np.random.default_rng(seed), rig=rig), axis=0, line=-2)
-    match = matched(seen, rig)
-    assert (match.ray == seen.ray[match.dot]).all()
-    assert len(match.ray) > 0.85 * len(seen.ray)
+    with pytest.raises(CannotMeasure) as caught:
+        matched(seen, rig)
+    assert caught.value.status == "no-match"
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -69,3 +81,15 @@ def test_labels_that_close_a_gap_are_ambiguous(axis: int, side: int) -> None:
         else:
             with pytest.raises(CannotMeasure, match="row" if axis == 0 else "column"):
                 refuse_hidden_rows(observed, found, USUAL_FIT)
+
+
+@pytest.mark.parametrize("kind", ["egg", "ellipse"])
+def test_pool_is_not_measured_if_dots_beyond_a_line_are_hidden(kind: str) -> None:
+    """Both were once measured about 30 % too low, as if the hidden dots' rays missed the pool."""
+    rig, pool = draw_pool(kind, np.random.default_rng([3, 3]))
+    seen = see(pool, np.random.default_rng(3), rig=rig)
+    assert len(matched(seen, rig).ray) > 0.9 * len(seen.ray)
+    u_px = seen.dots.image_px[:, 0]
+    with pytest.raises(CannotMeasure) as caught:
+        matched(part_of(seen, u_px < np.quantile(u_px, 0.75)), rig)
+    assert caught.value.status == "no-match"
