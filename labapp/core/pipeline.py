@@ -30,11 +30,11 @@ from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.frame import LineFrame, measure_lines
 from labapp.core.match import Candidate, Match, RowsOpen
+from labapp.core.matching.checks.unexplained import NOTHING_EXPLAINS
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.match_rays import lattice_of_match, match_rays
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import Observation
-from labapp.core.matching.unexplained import NOTHING_EXPLAINS
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice, number_on_plane

@@ -8,7 +8,7 @@ import pytest
 
 from labapp.config.setup import parse_setup
 from labapp.core.geometry.bench import Bench
-from labapp.core.matching import unexplained
+from labapp.core.matching.checks import unexplained
 from labapp.core.matching.decision import with_rivals
 from labapp.core.matching.free_setup import with_setup_free
 from labapp.core.matching.hypothesis import (

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
-from labapp.core.matching import decision, unexplained
+from labapp.core.matching import decision
+from labapp.core.matching.checks import unexplained
 from labapp.core.matching.decision import decide
 from labapp.core.matching.hypothesis import Hypothesis, evaluate, shifted_labels
 from labapp.core.matching.match_settings import MatchSettings

@@ -313,3 +313,20 @@ def test_setup_part_becomes_the_mean_variance_of_ever_rarer_frames() -> None:
     for _ in range(2 * fit.MOST_AVERAGED):
         parts = fit.parts_after((replace(parts[0], used=10**6),), np.ones(9), sizes)
     assert parts[0].averaged == fit.MOST_AVERAGED
+
+
+@pytest.mark.parametrize(
+    ("used", "expected"), [(fit.SETUP_EVERY - 1, 3.0), (fit.SETUP_EVERY, np.sqrt(4.5))]
+)
+def test_setup_part_of_a_frame_is_the_kept_one_or_the_mean_with_its_own(
+    used: int, expected: float
+) -> None:
+    """With an exact set-up the frame's own is 0."""
+    pool = spherical_cap(5.6, 0.25)
+    match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG)
+    surface = fit.fit_surface(match, OPEN_RIG, FitSettings())
+    made, sizes = fit.bound_and_measure(match, surface, OPEN_RIG, FitSettings())
+    part = fit.SetupPart(np.full(9, 3.0), sizes.sizes, used=used)
+    previous = fit.FromPrevious(made.boundary, (part,))
+    again, _ = fit.bound_and_measure(match, surface, OPEN_RIG, FitSettings(), previous)
+    np.testing.assert_allclose(again.size_sigma_setup, np.full(9, expected))

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
-from labapp.core.matching import decision, match_rays, repair, unexplained
+from labapp.core.matching import decision, match_rays, repair
+from labapp.core.matching.checks import unexplained
+from labapp.core.matching.checks.unexplained import explains, suffices
 from labapp.core.matching.hypothesis import Hypothesis, evaluate
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.matching.repair import with_repaired
-from labapp.core.matching.unexplained import explains, suffices
 from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice
 from labapp.core.values import CannotMeasure, IntArray
 from labapp.simulation.pools import egg

@@ -10,11 +10,11 @@ import pytest
 from scipy.ndimage import convolve, maximum_filter
 
 from labapp.core.matching import match_kernels, observation
+from labapp.core.matching.checks.unsupported_labels import unsupported
 from labapp.core.matching.decision import fitted_labels
 from labapp.core.matching.hypothesis import USUAL_FIT, evaluate
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import sure_pairs
-from labapp.core.matching.unsupported_labels import unsupported
 from labapp.core.surface.level import KnownRays
 from labapp.core.surface.pool_fit import FittedPool
 from labapp.core.values import FloatArray, IntArray

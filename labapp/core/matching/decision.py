@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from labapp.core.matching.checks.hidden_rows import refuse_hidden_rows
+from labapp.core.matching.checks.unexplained import MOST_SCATTERED, any_explains, refuse_unexplained
+from labapp.core.matching.checks.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open, unconfirmed
-from labapp.core.matching.hidden_rows import refuse_hidden_rows
 from labapp.core.matching.hypothesis import (
     FINE_FIT,
     KNOT_ERROR_MM,
@@ -31,8 +33,6 @@ from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
-from labapp.core.matching.unexplained import MOST_SCATTERED, any_explains, refuse_unexplained
-from labapp.core.matching.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
 from labapp.core.values import CannotMeasure, IntArray

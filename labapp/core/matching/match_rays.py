@@ -35,6 +35,15 @@ from labapp.core.match import (
     missing_share,
     signs_of,
 )
+from labapp.core.matching.checks.unexplained import (
+    MOST_SCATTERED,
+    MOST_SCATTERED_AT_LAST,
+    MOST_SCATTERED_OF_ALL,
+    NOTHING_EXPLAINS,
+    any_explains,
+    explains_half,
+    suffices,
+)
 from labapp.core.matching.decision import (
     MISFIT_MM,
     MISFIT_TIMES,
@@ -72,15 +81,6 @@ from labapp.core.matching.observation import (
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import certain_states
 from labapp.core.matching.repair import with_repaired, with_rows_beyond
-from labapp.core.matching.unexplained import (
-    MOST_SCATTERED,
-    MOST_SCATTERED_AT_LAST,
-    MOST_SCATTERED_OF_ALL,
-    NOTHING_EXPLAINS,
-    any_explains,
-    explains_half,
-    suffices,
-)
 from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_dots
 from labapp.core.surface.solver import inverse_of
 from labapp.core.surface.spline import SplineSurface

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import scipy
 
+from labapp.core.matching.checks.unexplained import explains, suffices
 from labapp.core.matching.hypothesis import (
     FINE_FIT,
     KNOT_ERROR_MM,
@@ -20,7 +21,6 @@ from labapp.core.matching.prediction import (
     pair_deviances,
     predict,
 )
-from labapp.core.matching.unexplained import explains, suffices
 from labapp.core.values import BoolArray, IntArray
 
 DISCARDED_RINGS = 2

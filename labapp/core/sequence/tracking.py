@@ -18,13 +18,13 @@ import numpy as np
 
 from labapp.core.images import band_pass_kernels
 from labapp.core.match import Trial, missing_share
+from labapp.core.matching.checks.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.label_growth import OUTLIER_SPACINGS, OUTLIER_TIMES
 from labapp.core.matching.match_rays import match_of_pairs
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, amid, count_labels, widened
 from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_states, classify_rays
-from labapp.core.matching.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.schemes import LEAST_DOTS
 from labapp.core.schemes.fit import UNSETTLED_MM
 from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Prior, Tracked, predictions

@@ -29,14 +29,13 @@ more."""
 
 def refuse_hidden_rows(observed: Observation, best: Hypothesis, fit_settings: FitSettings) -> None:
     """Raise ``ambiguous-rows`` if the labels cost less with a row or column hidden between them."""
-    own = evaluate_averaged(observed, best.labels, fit_settings, best.pool)
     for axis, inner, outer in _wide_gaps(observed, best.labels):
         labels = _moved_outwards(best.labels, axis, inner, outer)
-        pool = None if labels is None else try_fit(observed, labels, initial=best.pool)
-        if labels is None or pool is None or own is None:
+        if labels is None or (pool := try_fit(observed, labels, initial=best.pool)) is None:
             continue
+        own = evaluate_averaged(observed, best.labels, fit_settings, best.pool)
         rival = evaluate_averaged(observed, labels, fit_settings, pool)
-        if rival is None:
+        if own is None or rival is None:
             continue
         hidden = int(np.count_nonzero(rival.missed_rays[:, axis] == outer))
         moved = np.count_nonzero((labels != best.labels) & (labels != UNLABELLED))
@@ -45,8 +44,8 @@ def refuse_hidden_rows(observed: Observation, best: Hypothesis, fit_settings: Fi
             line = "row" if axis == 0 else "column"
             raise CannotMeasure(
                 "ambiguous-rows",
-                f"a {line} of dots seems to be hidden next to {line} {inner + 1} of the rays: "
-                f"correct the dots and mark it as blocked",
+                f"a {line} of dots seems to be hidden beside {line} {inner + 1} of the rays: "
+                "number rows and columns by hand",
             )
 
 
