@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from unittest import mock
 
+import numpy as np
 import pytest
 
 from labapp.config.setup import parse_setup
 from labapp.core.geometry.bench import Bench
+from labapp.core.images.dots import Dots
+from labapp.core.matching import match_rays
 from labapp.core.matching.checks import unexplained
 from labapp.core.matching.decision import with_rivals
 from labapp.core.matching.free_setup import with_setup_free
@@ -24,7 +28,7 @@ from tests.benchmarks import clutter_recordings, rendered
 from tests.benchmarks.clutter import as_entered, draw, with_setup_errors
 from tests.benchmarks.dips import PoolResult, measure_pool
 from tests.core.test_dips import true_labels
-from tests.scenes import BENCH_VIEW, FRAME_SHAPE
+from tests.scenes import BENCH_VIEW, FRAME_SHAPE, SeenDots, as_dots
 
 
 def result_of(kind: str, seed: int) -> PoolResult:
@@ -106,6 +110,26 @@ def test_setup_wrong_within_its_uncertainty_does_not_prevent_a_match(kind: str, 
 
 
 @pytest.mark.slow
+def test_no_setup_is_tried_if_most_dots_have_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None would help, and the search took half a minute for a frame with a second grid of dots."""
+    tried = mock.Mock(side_effect=match_rays.with_setups_free)
+    monkeypatch.setattr(match_rays, "with_setups_free", tried)
+    for false in (0, 200):
+        rig, seen, pool = draw("concave", 102, 0.05, 12)
+        strays = as_dots(np.random.default_rng(3).uniform(10.0, 470.0, (false, 2)))
+        dots = Dots(
+            *(
+                np.concatenate([getattr(part, each.name) for part in (seen.dots, strays)])
+                for each in fields(Dots)
+            )
+        )
+        ray = np.concatenate([seen.ray, np.zeros((false, 2), np.int64)])
+        found = measure_pool(pool, SeenDots(dots, ray), with_setup_errors(rig, 102, 1.0))
+        assert tried.called == (false == 0)
+        assert false == 0 or found.status == "no-match"
+        tried.reset_mock()
+
+
 def test_rows_found_with_another_setup_must_be_clearer() -> None:
     """Wrong rows led by more than three of the usual margins when fewer others were compared."""
     clutter = clutter_recordings.Clutter(missing=0.05, false=10)

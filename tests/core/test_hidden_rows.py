@@ -51,6 +51,14 @@ def test_row_beyond_a_hidden_one_gets_no_wrong_rays(kind: str, seed: int) -> Non
     assert caught.value.status == "ambiguous-rows"
 
 
+def test_dots_beyond_the_outermost_labels_tell_of_a_hidden_row() -> None:
+    """It was once measured with five wrong labels, while growth left the row beyond out."""
+    rig, pool = draw_pool("rippled", np.random.default_rng([15, 3]))
+    seen = without(see(pool, np.random.default_rng(15), rig=rig), axis=0, line=2)
+    with pytest.raises(CannotMeasure):
+        matched(seen, rig)
+
+
 @pytest.mark.parametrize(("kind", "seed"), [("egg", 2), ("cap", 3), ("ellipse", 5)])
 def test_pool_with_a_hidden_row_at_the_head_is_not_measured(kind: str, seed: int) -> None:
     """Each was once measured 17 to 21 % too low: rays of the hidden row seemed to miss the pool."""

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from labapp.core.matching.hypothesis import MISSED_COST, Hypothesis, evaluate_averaged
+from labapp.core.matching.label_growth import grow_labels
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
@@ -31,22 +32,44 @@ def refuse_hidden_rows(observed: Observation, best: Hypothesis, fit_settings: Fi
     """Raise ``ambiguous-rows`` if the labels cost less with a row or column hidden between them."""
     for axis, inner, outer in _wide_gaps(observed, best.labels):
         labels = _moved_outwards(best.labels, axis, inner, outer)
-        if labels is None or (pool := try_fit(observed, labels, initial=best.pool)) is None:
-            continue
         own = evaluate_averaged(observed, best.labels, fit_settings, best.pool)
-        rival = evaluate_averaged(observed, labels, fit_settings, pool)
-        if own is None or rival is None:
+        if labels is None or own is None:
             continue
-        hidden = int(np.count_nonzero(rival.missed_rays[:, axis] == outer))
+        # Dots farther out may have a ray then.
+        grown = grow_labels(observed, labels) if best.stray_count else None
+        rivals = [labels] if grown is None else [labels, grown]
+        cost = min(
+            _cost_if_hidden(observed, each, best, axis, outer, fit_settings) for each in rivals
+        )
         moved = np.count_nonzero((labels != best.labels) & (labels != UNLABELLED))
-        ahead = AHEAD_FEW if moved <= FEW else AHEAD
-        if rival.cost - MISSED_COST * hidden < own.cost + ahead:
+        if cost < own.cost + (AHEAD_FEW if moved <= FEW else AHEAD):
             line = "row" if axis == 0 else "column"
             raise CannotMeasure(
                 "ambiguous-rows",
                 f"a {line} of dots seems to be hidden beside {line} {inner + 1} of the rays: "
                 "number rows and columns by hand",
             )
+
+
+def _cost_if_hidden(
+    observed: Observation,
+    labels: IntArray,
+    best: Hypothesis,
+    axis: int,
+    hidden: int,
+    fit_settings: FitSettings,
+) -> float:
+    """Cost of labels, the missed rays of the hidden row or column excepted; infinite without a fit.
+
+    If growth labelled a dot in that row or column, it is not hidden, and the cost is infinite.
+    """
+    pool = try_fit(observed, labels, initial=best.pool)
+    if pool is None or (labels.take(hidden, axis) != UNLABELLED).any():
+        return np.inf
+    rival = evaluate_averaged(observed, labels, fit_settings, pool)
+    if rival is None:
+        return np.inf
+    return rival.cost - MISSED_COST * np.count_nonzero(rival.missed_rays[:, axis] == hidden)
 
 
 def _wide_gaps(observed: Observation, labels: IntArray) -> Iterator[tuple[int, int, int]]:
