@@ -723,6 +723,37 @@ def test_calibrate_laser_prints_and_writes_its_values(labapp: Run, tmp_path: Pat
     assert f"{setup}: pattern: missing" in stderr
 
 
+@pytest.mark.parametrize(
+    "lengths",
+    [
+        "--l1 18.54 --l2 18.54 --l3 18.54",  # 90°
+        "--l1 0.01366 --l2 0.01854 --l3 0.00786",  # in m: ± 369°
+        "--l1 13660 --l2 18540 --l3 7860",
+    ],
+)
+def test_impossible_laser_is_not_written_into_the_setup(
+    labapp: Run, tmp_path: Path, lengths: str
+) -> None:
+    setup = tmp_path / "setup.toml"
+    setup.write_bytes(SETUP.read_bytes())
+    assert labapp("calibrate", "laser", *lengths.split(), "--setup", setup)[0] == 2
+    assert setup.read_bytes() == SETUP.read_bytes()
+
+
+def test_frames_of_another_size_leave_earlier_results(labapp: Run, tmp_path: Path) -> None:
+    out, setup = tmp_path / "out", tmp_path / "setup.toml"
+    setup.write_bytes(SETUP.read_bytes())
+    command = ["reconstruct", SAMPLE / "calibration.png", "--setup", setup, "--out", out]
+    labapp(*command)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    text = setup.read_text("utf-8")
+    setup.write_text(text.replace("[image_calibration]", "[image_calibration]\nframe_px = [9, 9]"))
+    code, _, stderr = labapp(*command)
+    assert code == 2
+    assert "calibration.png: size" in stderr
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
 def test_setup_is_calibrated_after_both_calibrations(labapp: Run, tmp_path: Path) -> None:
     from labapp.config.setup import read_setup
 

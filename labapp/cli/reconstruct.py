@@ -191,6 +191,7 @@ def _measure_recording(
     with open_source(source_path) as source, progress_bar() as progress:
         for warning in source.warnings:
             note(progress.console, f"warning: {warning}")
+        setup.require_size(source.shape, str(source_path))
         selected = select_frames(frames, len(source))
         origin = provenance(source, source_path, setup_path, setup, settings, selected, warm)
         results = ResultsWriter(out, setup.calibration, origin, surfaces, sigma_parts)

@@ -186,18 +186,24 @@ def update_setup(
     values
         Section → key → value; None removes the key.
     complete
-        Whether the changed set-up must be valid. Otherwise it is not checked: read the file back to
-        find what is still missing or wrong.
+        Whether the changed set-up must be valid. Otherwise only the given values must be: read the
+        file back to find what is still missing or wrong.
 
     Raises
     ------
     InputError
-        If the file exists and is not TOML, cannot be written, or would not be valid.
+        If the file exists and is not TOML, cannot be written, or would not be valid. The file is
+        unchanged then.
     """
     path = Path(path)
     text = updated_setup(read_text(path, A_SETUP) if path.exists() else "", path, values)
-    if complete:
+    try:
         parse_setup(text_with_rays(text, path, parse_toml(text, path, A_SETUP)), path)
+    except InputError as error:
+        given = {f"{section}.{key}" for section, keys in values.items() for key in keys}
+        wrong = [one for one in error.problems if complete or one.field in given]
+        if wrong:
+            raise InputError.gather(wrong) from error
     with os_errors_as_input(path, "file", "a file that can be written"):
         if path.exists() and not os.access(path, os.W_OK):
             raise PermissionError(13, "write-protected")

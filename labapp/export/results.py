@@ -129,9 +129,7 @@ class ResultsWriter:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._lock.enter_context(only_writer(Path(os.path.realpath(folder))))
-            _clear(folder)
-            self._write_run()
-            self._open_tables()
+            _earlier_results(folder)
         except BaseException as error:
             self._close_files()
             if isinstance(error, OSError):
@@ -146,6 +144,7 @@ class ResultsWriter:
         InputError
             If it cannot be written (disk full, folder removed); earlier frames are complete.
         """
+        self._begin()
         before = {file: os.fstat(file.fileno()).st_size for file in self._files.values()}
         formats = SURFACES if self.surfaces else ()
         surfaces = {
@@ -189,6 +188,7 @@ class ResultsWriter:
         InputError
             If it cannot be written.
         """
+        self._begin()
         self._run |= {"setup_status": status, "setup_check": asdict(verdict)}
         if DOUBTFUL not in (status, *self._statuses):
             return
@@ -208,25 +208,38 @@ class ResultsWriter:
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        """Write the final state of the run to `run.json`."""
+        """Write the final state of the run; without a frame, results of an earlier run are kept."""
         try:
             try:
-                self._write_state(error)
+                if error is None or not _earlier_results(self.folder):
+                    self._begin()
+                if self._files:
+                    self._write_state(error)
             finally:
                 self._close_files()
         except OSError as failure:
             if error is None:
                 raise self._unwritable(failure) from failure
 
-    def _open_tables(self) -> None:
-        """Create the tables with their headers."""
+    def _begin(self) -> None:
+        """Replace the results of an earlier run by tables without frames, if not done yet.
+
+        As late as the first frame is done: what prevents its measurement does not cost results.
+        """
+        if self._files:
+            return
         try:
+            for path in _earlier_results(self.folder):
+                path.unlink()
+            self._write_run()
             for name in TABLES:
                 self._files[name] = io.FileIO(self.folder / f"{name}.csv", "a")
                 write_all(self._files[name], as_bytes(csv_header(name, self._sigma_parts)))
         except BaseException as error:
             with suppress(OSError):
                 self._write_state(error)
+            if isinstance(error, OSError):
+                raise self._unwritable(error) from error
             raise
 
     def _write_state(self, error: BaseException | None) -> None:
@@ -256,8 +269,14 @@ class ResultsWriter:
         )
 
 
-def _clear(folder: Path) -> None:
-    """Delete a former run's results, `measures.csv` first, so that no row is without its files."""
+def _earlier_results(folder: Path) -> list[Path]:
+    """Files of an earlier run, `measures.csv` first: if it is deleted, no row lacks its files.
+
+    Raises
+    ------
+    InputError
+        If they may be the user's, or `run.json` is a link.
+    """
     if (folder / RUN_FILE).is_symlink():  # `write_atomically` would follow it
         raise InputError(folder, RUN_FILE, "is a link", "a folder whose files are its own")
     ours = [path for path in folder.iterdir() if RESULT_NAMES.fullmatch(path.name)]
@@ -268,8 +287,7 @@ def _clear(folder: Path) -> None:
             f"holds {ours[0].name} and no {RUN_FILE}",
             "an empty folder, or one with an earlier run (it is replaced)",
         )
-    for path in sorted(ours, key=lambda path: path.name != "measures.csv"):
-        path.unlink()
+    return sorted(ours, key=lambda path: path.name != "measures.csv")
 
 
 def _is_run(path: Path) -> bool:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.config.setup import read_setup, update_setup
+from labapp.config.setup import read_setup, update_setup, updated_setup
 from labapp.config.setup_text import frame_px_of
 from labapp.core.geometry.rig import Laser
 from labapp.core.geometry.uncertainty import (
@@ -263,6 +263,24 @@ def test_any_value_is_accepted_or_raises_an_input_error(
     assert np.isfinite(setup.calibration.matrix).all()
 
 
+def write_values(path: Path, values: dict[str, dict[str, object]]) -> None:
+    """Change a setup file as `update_setup`, without its check."""
+    path.write_text(updated_setup(path.read_text(), path, values))
+
+
+@pytest.mark.parametrize("lacking", ["", "[electrode]"])
+def test_update_refuses_only_wrong_values_of_its_own(path: Path, lacking: str) -> None:
+    path.write_text(path.read_text().replace(lacking, "[other]") if lacking else path.read_text())
+    before = path.read_text()
+    with pytest.raises(InputError) as caught:
+        update_setup(path, {"laser": {"projection_angle_deg": 90.0, "distance_mm": 40.0}})
+    assert caught.value.field == "laser.projection_angle_deg"
+    assert caught.value.others == ()
+    assert path.read_text() == before
+    update_setup(path, {"laser": {"projection_angle_deg": 40.0}})
+    assert "projection_angle_deg = 40.0" in path.read_text()
+
+
 def test_update_preserves_comments_and_other_keys(path: Path) -> None:
     update_setup(path, {"laser": {"projection_angle_deg": 30.5, "distance_mm": 40.0}})
     expected = SETUP.replace("31.14", "30.5").replace("31.48", "40.0")
@@ -448,7 +466,7 @@ def test_glass_and_welding_direction_are_read(path: Path) -> None:
 def test_wrong_glass_and_directions_are_rejected(
     path: Path, section: str, key: str, value: object, field: str
 ) -> None:
-    update_setup(path, {section: {key: value}})
+    write_values(path, {section: {key: value}})
     with pytest.raises(InputError) as caught:
         read_setup(path)
     assert caught.value.field == field
@@ -514,7 +532,7 @@ def test_calibration_points_have_a_full_covariance(path: Path) -> None:
     ],
 )
 def test_wrong_covariances_of_points_are_rejected(path: Path, key: str, value: object) -> None:
-    update_setup(path, {"image_calibration": {key: value}})
+    write_values(path, {"image_calibration": {key: value}})
     with pytest.raises(InputError) as caught:
         read_setup(path)
     assert caught.value.field == f"image_calibration.{key}"
@@ -551,6 +569,6 @@ def test_changed_points_discard_the_size_of_the_calibration_picture(
 
 @pytest.mark.parametrize("size", [[640], [640, 0], [640.5, 480], "640×480", True])
 def test_wrong_size_of_the_calibration_picture_is_rejected(path: Path, size: object) -> None:
-    update_setup(path, {"image_calibration": {"frame_px": size}})
+    write_values(path, {"image_calibration": {"frame_px": size}})
     with pytest.raises(InputError, match="frame_px"):
         read_setup(path)

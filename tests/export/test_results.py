@@ -233,6 +233,16 @@ def test_only_files_of_a_former_run_are_replaced(
     assert [row["frame"] for row in table(written / "measures.csv")] == ["3"]
 
 
+def test_run_that_fails_before_its_first_frame_leaves_the_former_one(
+    written: Path, writer: Writer
+) -> None:
+    before = {path.name: path.read_bytes() for path in written.iterdir()}
+    for error in (InputError("frame 0", "size", "1×1 px", "480×640 px"), KeyboardInterrupt()):
+        with pytest.raises(type(error)), writer(written):
+            raise error
+        assert {path.name: path.read_bytes() for path in written.iterdir()} == before
+
+
 def test_two_runs_do_not_mix_in_a_folder(out: Path, writer: Writer, measured: Measurement) -> None:
     with writer(out) as files:
         files.write(FrameResult(0, 0.0, measured))
@@ -342,8 +352,9 @@ def test_run_whose_tables_cannot_be_opened_has_failed(tmp_path: Path, writer: Wr
     with (
         mock.patch.object(results, "write_all", side_effect=OSError(28, "No space left")),
         pytest.raises(InputError),
+        writer(tmp_path),
     ):
-        writer(tmp_path)
+        pass
     run = json.loads((tmp_path / "run.json").read_text())
     assert (run["state"], run["frames_done"]) == ("failed", 0)
     assert run["ended"] is not None

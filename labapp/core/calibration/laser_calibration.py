@@ -26,6 +26,9 @@ import scipy
 from labapp.core.geometry.rig import Laser
 from labapp.core.values import FloatArray
 
+LONGEST_MM = 1e4
+"""Lengths of a cross-hair are shorter."""
+
 COVERAGE_FACTOR = 1.959964
 """Half width of the 95 % interval of a normal distribution, in units of σ."""
 
@@ -229,8 +232,9 @@ def _length(readings: npt.ArrayLike, name: str, settings: LaserCalibrationSettin
     if values.size == 0:
         raise ValueError(f"{name} is empty: give at least one reading in mm")
     for value in values:
-        if not (np.isfinite(value) and value > 0.0):
-            raise ValueError(f"{name} = {value:g}: a reading is a positive number of mm")
+        if not 0.0 < value < LONGEST_MM:
+            allowed = f"a reading is a number of mm above 0 and below {LONGEST_MM:g}"
+            raise ValueError(f"{name} = {value:g}: {allowed}")
     mean, count = float(values.mean()), values.size
     # Averaging reduces the rounding error of readings only if they scatter beyond the resolution.
     least = settings.resolution_mm / np.sqrt(12.0)
