@@ -402,6 +402,13 @@ def test_only_an_earlier_simulation_is_replaced(tmp_path: Path, labapp: Run) -> 
     (out / "mine.txt").unlink()
     for _ in range(2):
         assert labapp("simulate", path, "--out", out, "--frames", 1)[0] == 0
+    setup = out / "setup.toml"
+    simulated = setup.read_text("utf-8")
+    setup.write_text(f"{simulated}# calibrated anew\n", "utf-8")
+    code, _, stderr = labapp("simulate", path, "--out", out, "--frames", 1)
+    assert code == 2
+    assert "setup.toml" in stderr
+    assert setup.read_text("utf-8") != simulated
     (out / "scenario.toml").unlink()
     code, _, stderr = labapp("simulate", path, "--out", out, "--frames", 1)
     assert code == 2

@@ -10,7 +10,7 @@ import typer
 
 from labapp.cli.shared import finite, progress_shown, writable_folder
 from labapp.errors import InputError, os_errors_as_input
-from labapp.files import write_file
+from labapp.export.owned_files import check_owned, write_owned
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics, DynamicsSettings
@@ -39,7 +39,12 @@ def dynamics(
     source: Annotated[
         Path, typer.Argument(help="A session, or a folder that `labapp reconstruct` wrote.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for tables and pictures; made if missing.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder for tables and pictures. Earlier ones are replaced if unchanged."
+        ),
+    ],
     *,
     of: Annotated[
         str,
@@ -81,19 +86,17 @@ def dynamics(
     responses.csv, with standard uncertainties; dynamics.png, modes.png; with --film, mode.mp4.
     """
     from labapp.core.dynamics.analysis import DynamicsSettings
-    from labapp.export.dynamics import dynamics_files, write_mode_film
+    from labapp.export.dynamics import dynamics_files
     from labapp.session.signals import read_signals
 
     folder = writable_folder(out)
+    check_owned(folder, "dynamics")
     settings = DynamicsSettings(of, _band(band), segment)
     given = read_signals(signals, full_scale) if signals else None
     with progress_shown():
         found = _analysed(source, given, start, align, settings)
     with os_errors_as_input(folder, "results", "enough disk space"):
-        for name, content in dynamics_files(found).items():
-            write_file(folder / name, content)
-        if film is not None:
-            write_mode_film(folder / "mode.mp4", found, film)
+        write_owned(folder, "dynamics", dynamics_files(found, film))
     _print(found)
     typer.echo(f"Results are in {folder.absolute()}")
 

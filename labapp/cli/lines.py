@@ -21,7 +21,7 @@ from labapp.cli.shared import (
     writable_folder,
 )
 from labapp.errors import InputError, os_errors_as_input
-from labapp.files import write_file
+from labapp.export.owned_files import check_owned, write_owned
 from labapp.text import csv_text
 
 if TYPE_CHECKING:
@@ -34,7 +34,9 @@ if TYPE_CHECKING:
 def lines(
     source: Recording,
     setup: Annotated[Path, typer.Option(help='Setup file (TOML) with [pattern] kind = "lines".')],
-    out: Annotated[Path, typer.Option(help="Folder for the tables; made if missing.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder for the tables. Earlier ones are replaced if unchanged.")
+    ],
     frames: FrameRange = ":",
     follow: Annotated[
         bool,
@@ -69,13 +71,14 @@ def lines(
     follow = follow or bench.rig.pattern.rows == 1
     current = None if signals is None else _current(signals, start, follow)
     with open_source(source) as recording:
+        bench.require_size(recording.shape, str(source))
         chosen = select_frames(frames, len(recording))
         folder = writable_folder(out)
+        check_owned(folder, "lines")
         with os_errors_as_input(folder, "results", "enough disk space"):
             done = _measured(recording, chosen, bench, follow, current)
-            any_line = (
-                _write_followed(done, folder) if follow else _write_measured(done, folder, bench)
-            )
+            any_line, tables = _followed(done) if follow else _tables(done, bench)
+            write_owned(folder, "lines", tables)
     typer.echo(f"Results are in {folder.absolute()}")
     if len(done) < len(chosen):
         raise typer.Exit(INTERRUPTED)
@@ -128,8 +131,8 @@ def _measured(
     return done
 
 
-def _write_measured(done: list[FrameResult], folder: Path, bench: Setup) -> bool:
-    """Write the tables of frames measured one by one; returns whether any has lines."""
+def _tables(done: list[FrameResult], bench: Setup) -> tuple[bool, dict[str, bytes]]:
+    """Whether any of the frames measured one by one has lines, and their tables, by file name."""
     from labapp.core.lines.states import LineSeries, line_changes, line_states
     from labapp.core.recording.residual_check import doubt_of_values, judged_status
     from labapp.export.line_results import line_tables, of_lines
@@ -137,8 +140,7 @@ def _write_measured(done: list[FrameResult], folder: Path, bench: Setup) -> bool
     frames = of_lines(done)
     found = [one.lines for one in frames]
     status = judged_status(bench.rig, doubt_of_values(bench.rig))
-    for name, text in line_tables(frames, bench.calibration, status).items():
-        write_file(folder / name, text.encode())
+    tables = line_tables(frames, bench.calibration, status)
     series = LineSeries.of(found)
     states = line_states(series)
     for name, counts in (("frames", [one.measurement.status for one in done]), ("states", states)):
@@ -146,11 +148,12 @@ def _write_measured(done: list[FrameResult], folder: Path, bench: Setup) -> bool
         typer.echo(f"{name}: {shown}")
     for k, before, after in line_changes(series):
         typer.echo(f"frame {frames[k].frame}: from {before} lines to {after}")
-    return any(one.seen.lines for one in found)
+    is_any = any(one.seen.lines for one in found)
+    return is_any, {name: text.encode() for name, text in tables.items()}
 
 
-def _write_followed(done: list[FrameResult], folder: Path) -> bool:
-    """Write the table of a followed line; returns whether it was found in any frame."""
+def _followed(done: list[FrameResult]) -> tuple[bool, dict[str, bytes]]:
+    """Whether a followed line was found in any frame, and its table, by file name."""
     import numpy as np
 
     from labapp.core.lines.pulses import pulse_frequency
@@ -158,8 +161,7 @@ def _write_followed(done: list[FrameResult], folder: Path) -> bool:
     from labapp.export import line_results as tables
 
     frames = tables.of_lines(done)
-    rows = tables.track_rows(frames)
-    write_file(folder / "track.csv", csv_text([tables.TRACK_COLUMNS, *rows]).encode())
+    table = csv_text([tables.TRACK_COLUMNS, *tables.track_rows(frames)])
     found = [one.lines for one in frames]
     on = np.array([one.status == "pulse" for one in found], bool)
     shift = np.array([np.nan if one.track is None else one.track.shift_px for one in found])
@@ -174,4 +176,4 @@ def _write_followed(done: list[FrameResult], folder: Path) -> bool:
     hertz, strength = oscillation_frequency(time_s[known_time], shift[known_time])
     if np.isfinite(hertz):
         typer.echo(f"strongest oscillation: {hertz:.2f} Hz, {strength:.0%} of the line's motion")
-    return bool(known.any())
+    return bool(known.any()), {"track.csv": table.encode()}

@@ -233,7 +233,7 @@ def progress_bar() -> Progress:
 
 def note(console: Console, text: str) -> None:
     """Print a line on stderr, above the progress bar."""
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
 
 
 def warned(setup: Setup) -> Setup:
@@ -377,7 +377,7 @@ def check_target(
     expected = f"a new file, or an earlier result to replace ({kinds})"
     if any(path.exists() and out.samefile(path) for path in inputs):
         raise InputError(out, option, "is an input of the command", expected)
-    if out.suffix.lower() not in suffixes:
+    if not {out.suffix.lower(), Path(os.path.realpath(out)).suffix.lower()} <= set(suffixes):
         raise InputError(out, option, "is there already, and of another kind", expected)
 
 

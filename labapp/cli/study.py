@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -82,6 +83,7 @@ def run(
 
     opened = Study(study, out)
     require_extra()
+    noted = set[str]()
     with progress_bar() as bar:
         task = bar.add_task(study.stem, total=None)
 
@@ -89,19 +91,17 @@ def run(
             words = f"{study.stem}: {now.recordings_done} of {now.recordings} recordings, frames"
             bar.update(task, description=words, completed=now.frames_done, total=now.frames or None)
 
+        def noting(text: str) -> None:
+            noted.add(text)
+            note(bar.console, text)
+
         try:
-            opened.run(
-                workers,
-                scheduler,
-                surfaces=surfaces,
-                progress=show,
-                note=lambda text: note(bar.console, text),
-            )
+            opened.run(workers, scheduler, surfaces=surfaces, progress=show, note=noting)
         except KeyboardInterrupt:
             counts = count_states(opened.status(surfaces=surfaces))
             note(bar.console, f"stopped: {counts}; what was measured is kept: run it again")
             raise typer.Exit(INTERRUPTED) from None
-    _finish(opened, surfaces)
+    _finish(opened, surfaces, noted)
 
 
 @app.command()
@@ -143,16 +143,20 @@ def results(
     _finish(Study(study, out), surfaces)
 
 
-def _finish(study: Study, surfaces: bool) -> None:
-    """Write the results, print the means, and exit with 1 unless all is measured."""
+def _finish(study: Study, surfaces: bool, noted: Collection[str] = ()) -> None:
+    """Write the results, print the means, and exit with 1 unless all is measured.
+
+    Problems that were ``noted`` already are not printed again.
+    """
     summary = study.results(surfaces=surfaces)
     from labapp.run.study.plan import named_condition
     from labapp.run.study.status import count_states
 
     states = [one.status for one in summary.recordings]
     for one in states:
-        if one.state != "done" and one.problem:
-            typer.echo(f"{one.recording.name}: {one.problem}", err=True)
+        problem = f"{one.recording.name}: {one.problem}"
+        if one.state != "done" and one.problem and problem not in noted:
+            typer.echo(problem, err=True)
     for group in summary.groups[:SHOWN]:
         at = ", ".join(named_condition(name, v) for name, v in group.conditions.items())
         means = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -283,13 +284,20 @@ def dynamics_pictures(found: Dynamics) -> dict[str, Figure]:
     return {"dynamics": whole, "modes": modes}
 
 
-def dynamics_files(found: Dynamics) -> dict[str, bytes]:
-    """Return tables (CSV) and pictures (PNG) by file name."""
+def dynamics_files(found: Dynamics, film: str | None = None) -> dict[str, bytes]:
+    """Return tables (CSV), pictures (PNG) and, if a mode is named, its film (MP4), by file name.
+
+    Raises
+    ------
+    InputError
+        If there is no such mode, or 3-D pictures cannot be drawn.
+    """
     from labapp.studies.plotting import as_bytes
 
     tables = {name: text.encode() for name, text in dynamics_tables(found).items()}
     pictures = dynamics_pictures(found).items()
-    return tables | {f"{name}.png": as_bytes(figure) for name, figure in pictures}
+    films = {} if film is None else {"mode.mp4": _mode_film(found, film)}
+    return tables | {f"{name}.png": as_bytes(figure) for name, figure in pictures} | films
 
 
 def mode_heights(one: ModeCourse, turn: float) -> FloatArray:
@@ -331,14 +339,8 @@ def mode_scenes(found: Dynamics, one: ModeCourse) -> Iterator[Scene]:
         yield replace(scene, within_mm=within, stamp=stamp)
 
 
-def write_mode_film(path: Path, found: Dynamics, name: str) -> None:
-    """Write a film (MP4) of one mode.
-
-    Raises
-    ------
-    InputError
-        If there is no such mode, or 3-D pictures cannot be drawn.
-    """
+def _mode_film(found: Dynamics, name: str) -> bytes:
+    """Film of one mode; errors as `dynamics_files`."""
     from labapp.export.rendering.film import write_video
     from labapp.export.rendering.studio import draw_there, drawing_errors, drawing_process
 
@@ -349,7 +351,10 @@ def write_mode_film(path: Path, found: Dynamics, name: str) -> None:
     with drawing_errors("film"), drawing_process() as process:
         pictures = list(process.map(draw_there, mode_scenes(found, every[wanted])))
     count = FILM_PERIODS * FILM_FRAMES
-    write_video(path, pictures * FILM_PERIODS, np.arange(count + 1) / FILM_HZ)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "mode.mp4"
+        write_video(path, pictures * FILM_PERIODS, np.arange(count + 1) / FILM_HZ)
+        return path.read_bytes()
 
 
 def _closed(values: FloatArray) -> FloatArray:

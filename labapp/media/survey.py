@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.errors import InputError
-from labapp.media.base import Frame, FrameSource, GreyImage
+from labapp.media.base import FrameSource, GreyImage
 
 if TYPE_CHECKING:
     from labapp.media.formats.video import VideoSource
@@ -66,9 +66,13 @@ def survey(source: FrameSource, progress: Callable[[int, int], None] | None = No
     checksum = np.zeros(len(source), np.uint32)
     readable = np.zeros(len(source), bool)
     time_s = np.full(len(source), np.nan)
+    first_reason = ""
     for index in range(len(source)):
-        frame = _read(source, index)
-        if frame is not None:
+        try:
+            frame = source.frame(index)
+        except InputError as error:
+            first_reason = first_reason or str(error)
+        else:
             readable[index] = True
             checksum[index] = frame_checksum(frame.image)
             time_s[index] = np.nan if frame.time_s is None else frame.time_s
@@ -77,20 +81,15 @@ def survey(source: FrameSource, progress: Callable[[int, int], None] | None = No
     exact = True
     with source.reopen() as again:
         for count, index in enumerate(order, 1):
-            frame = _read(again, index)
-            exact &= (frame is not None) == bool(readable[index])
-            exact &= frame is None or frame_checksum(frame.image) == checksum[index]
+            try:
+                same = frame_checksum(again.frame(index).image) == checksum[index]
+            except InputError:
+                same = not readable[index]
+            exact &= bool(same)
             if progress is not None:
                 progress(len(source) + count, total)
-    warnings = (*_unread(readable), *_inexact(source, exact))
+    warnings = (*_unread(readable, first_reason), *_inexact(source, exact))
     return Survey(checksum, readable, time_s, exact, len(order), warnings)
-
-
-def _read(source: FrameSource, index: int) -> Frame | None:
-    try:
-        return source.frame(index)
-    except InputError:
-        return None
 
 
 def _order(source: FrameSource) -> list[int]:
@@ -104,12 +103,12 @@ def _order(source: FrameSource) -> list[int]:
     return [last, 0, *drawn, *sorted({max(0, k - 1) for k in drawn[:4]}, reverse=True)]
 
 
-def _unread(readable: npt.NDArray[np.bool_]) -> tuple[str, ...]:
+def _unread(readable: npt.NDArray[np.bool_], first_reason: str) -> tuple[str, ...]:
     numbers = np.flatnonzero(~readable).tolist()
     if not numbers:
         return ()
     named = ", ".join(map(str, numbers[:NAMED_FRAMES])) + " …" * (len(numbers) > NAMED_FRAMES)
-    return (f"{len(numbers)} of {len(readable)} frames cannot be read: {named}",)
+    return (f"{len(numbers)} of {len(readable)} frames cannot be read: {named} ({first_reason})",)
 
 
 def _inexact(source: FrameSource, exact: bool) -> tuple[str, ...]:

@@ -36,6 +36,9 @@ from labapp.text import now
 Progress = Callable[[int, int], None]
 """Called with the number of steps done and the total; may raise to stop."""
 
+SLOWEST_HZ, FASTEST_HZ = 1e-6, 1e8
+"""Limits of a given frame rate."""
+
 THE_RECORDING = "the recording; `labapp session relink` sets its new path"
 
 
@@ -101,8 +104,9 @@ class Frames:
         path = Path(path).absolute()
         if frame_rate_hz is not None:
             check_positive(frame_rate_hz, str(path), "frame rate", "frames a second")
-            if frame_rate_hz >= 1e8:
-                raise InputError(path, "frame rate", frame_rate_hz, "frames a second above 0")
+            if not SLOWEST_HZ <= frame_rate_hz <= FASTEST_HZ:
+                expected = f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} frames a second"
+                raise InputError(path, "frame rate", frame_rate_hz, expected)
         with open_source(path) as source:
             selected = select_frames(frames, len(source), str(path))
             found = survey(source, progress)

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from labapp.config.scenario import Scenario
+from labapp.config.scenario import Scenario, read_scenario
 from labapp.config.scenario_keys import RECORDINGS
 from labapp.errors import InputError, os_errors_as_input
 from labapp.session.creation import new_session
@@ -77,6 +77,9 @@ def _check_replaceable(out: Path) -> None:
     if names and (foreign or SCENARIO not in names):
         found = f"holds {foreign[0]}" if foreign else f"holds no {SCENARIO}"
         raise InputError(out, "folder", found, OWN_FOLDER)
+    setup = out / "setup.toml"
+    if setup.exists() and setup.read_text("utf-8") != read_scenario(out / SCENARIO, frames=1).setup:
+        raise InputError(out, setup.name, f"is not that of {SCENARIO}: it may be yours", OWN_FOLDER)
 
 
 def begin_session(

@@ -228,6 +228,7 @@ def test_palette_is_applied(tmp_path: Path) -> None:
         ({"t256": 60000}, "8 bits|bytes for"),
         ({"t273": 10**6}, "bytes; expected a complete image: TIFF"),
         ({"t277": 5}, "samples a pixel: 5|bytes for"),
+        ({"t256": 0, "t257": 0}, "size: 0×0 px"),
     ],
 )
 def test_impossible_tag_is_named(tmp_path: Path, other: dict[str, int], message: str) -> None:

@@ -9,7 +9,7 @@ import typer
 
 from labapp.cli.shared import NOTHING_MEASURED, progress_shown, writable_folder
 from labapp.errors import InputError
-from labapp.files import write_file
+from labapp.export.owned_files import check_owned, write_owned
 
 if TYPE_CHECKING:
     from labapp.studies.adviser.bench_limits import BenchLimits
@@ -23,7 +23,8 @@ def _range(text: str) -> Any:
 def advise(
     *,
     out: Annotated[
-        Path, typer.Option(help="Folder for the files of the advice, which are replaced.")
+        Path,
+        typer.Option(help="Folder for the advice. An earlier one in it is replaced if unchanged."),
     ],
     question: Annotated[
         Path | None,
@@ -87,22 +88,23 @@ def _advised(
     """Search for set-ups, print and write the advice; returns whether any set-up is possible."""
     from labapp.studies.adviser import check as adviser_check
     from labapp.studies.adviser import search as adviser
-    from labapp.studies.adviser.files import advice_files, patterns_of
+    from labapp.studies.adviser.files import FILES, advice_files, patterns_of
     from labapp.studies.adviser.report import advice_text, cost_table
 
     folder = writable_folder(out)
+    check_owned(folder, "advise", FILES)
     effort = adviser.QUICK if quick else adviser.Effort()
     with progress_shown() as progress:
         advice = adviser.advise(expected, limits, effort, seed, progress)
         typer.echo(advice_text(advice))
-        for name, content in advice_files(advice).items():
-            write_file(folder / name, content)
+        files = advice_files(advice)
+        write_owned(folder, "advise", files)
         if advice.possible:
             typer.echo("\n" + cost_table(advice).markdown())
             typer.echo(patterns_of(advice).markdown())
         if check and advice.possible:
             message = adviser_check.check_text(adviser_check.check(advice, progress=progress))
-            write_file(folder / "check.txt", message.encode() + b"\n")
+            write_owned(folder, "advise", {**files, "check.txt": message.encode() + b"\n"})
             typer.echo(message)
     typer.echo(f"Tables and picture are in {folder.absolute()}")
     return advice.possible

@@ -253,6 +253,9 @@ def _check_room(path: Path, page: tifffile.TiffPage, size: int) -> None:
         bits = max(bits, page.tilewidth * page.tilelength * page.bitspersample)
     if bits > MOST_BITS or math.prod(page.shape) > 4 * MOST_PIXELS:
         raise too_large(path, page.imagelength, page.imagewidth)
+    if bits == 0:
+        shown = f"{page.imagewidth}×{page.imagelength} px"
+        raise InputError(path, "size", shown, "a picture with pixels")
     if min(page.dataoffsets, default=0) <= 0 or _end(page) > size:
         raise InputError(path, "size", f"{size} bytes", A_TIFF)
     if bits > 8 * stored * (1 if page.compression == 1 else MAX_RATIO):

@@ -13,6 +13,9 @@ from labapp.studies.tables import Table
 
 SETUP = "setup.toml"
 
+FILES = ("advice.md", "advice.csv", "advice.png", "patterns.csv", SETUP, "check.txt")
+"""Names of all files of an advice; the last one is that of its check."""
+
 HEAD = """\
 # Recommended by labapp advise. Set the bench up so, then measure where it really
 # stands: labapp calibrate laser and labapp calibrate plane, both with --setup.
