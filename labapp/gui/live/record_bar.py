@@ -10,12 +10,11 @@ from PySide6.QtWidgets import QProgressBar, QWidget
 from labapp.gui.live.live import Live
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.labels import Message, allow, plain_label, set_font
+from labapp.gui.widgets.labels import Message, offer, plain_label, set_font
 from labapp.gui.widgets.layouts import hbox, vbox
 
 BEGIN, END = "● Record", "■ End recording"
 
-MARK = "Note this moment beside the recording that runs (M)"
 NOTHING_TO_MARK = "Only while it records: notes a moment beside the recording (M)"
 
 BUTTON_PX, RING_BAR_PX = 44, 96
@@ -44,7 +43,8 @@ class RecordBar(QWidget):
             "Record from some seconds before now on, or end the recording (Space, Ctrl+R)",
             trigger,
         )
-        self.mark_button = button("Mark", "", mark)
+        tip = "Note this moment beside the recording that runs (M)"
+        self.mark_button = button("Mark", tip, mark)
         stop_button = button(
             "Stop camera", "Release the camera; a recording is finished first", stop
         )
@@ -69,7 +69,7 @@ class RecordBar(QWidget):
 
     def show_recording(self, recording: bool) -> None:
         """Show on the record button whether a recording runs: by text, sign and red colour."""
-        allow(self.mark_button, MARK, "" if recording else NOTHING_TO_MARK)
+        offer(self.mark_button, "" if recording else NOTHING_TO_MARK)
         pressed = self.record_button
         pressed.setText(END if recording else BEGIN)
         palette = QPalette()

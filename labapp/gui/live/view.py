@@ -29,7 +29,7 @@ from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.exposure import ExposureBars
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import Message, allow
+from labapp.gui.widgets.labels import Message, offer
 from labapp.gui.widgets.layouts import Group, column_of, hbox
 from labapp.gui.workspace import Workspace
 from labapp.media.cameras import (
@@ -58,8 +58,6 @@ SLOW_MS = 300
 
 STATUS_S = 0.2
 """Minimum interval of updates of the figures."""
-
-START = "Show live what the camera sees"
 
 NO_LINES = "The simulated camera shows dots, and this session is of lines: choose another camera"
 
@@ -433,7 +431,7 @@ class LiveView(QObject):
         self.camera.setEnabled(live is None)
         for each in (self.start_button, self.find_button):
             each.setVisible(live is None)
-        allow(self.start_button, START, self._why_not())
+        offer(self.start_button, self._why_not())
         self.camera.refuse(self._why_not())
         if self.workspace.session is None or self._ending:
             self.start_button.setEnabled(False)
@@ -451,7 +449,7 @@ class LiveView(QObject):
             tooltip="Which camera to watch; the simulated one films a pool on this bench",
         )
         self.camera.edited.connect(lambda _: self._show_state())
-        self.start_button = button("Start", START, self.start)
+        self.start_button = button("Start", "Show live what the camera sees", self.start)
         self.find_button = button("Find cameras", "List the cameras that are connected", self.find)
         self.answer, self.counts = Message(2), Message(2)
         self.figures, self.penetration = LiveFigures(), LivePenetration(self.workspace, self._watch)

@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QVBoxLayout, QWidget
 from labapp.gui.shell.steps import Lead, State, read_only
 from labapp.gui.tasks import DONE, Task, Work
 from labapp.gui.widgets.fields import Field
-from labapp.gui.widgets.labels import Message, allow
+from labapp.gui.widgets.labels import Message, offer
 from labapp.gui.widgets.layouts import vbox
 from labapp.gui.workspace import Workspace
 
@@ -131,9 +131,6 @@ class Page(QWidget):
     def lock_with_session(self, *widgets: QWidget) -> None:
         """Disable these widgets, which change the session, while it is open read-only."""
         self._changing += widgets
-        for widget in widgets:
-            if not isinstance(widget, Field):
-                widget.setProperty("usual tip", widget.toolTip())
         self._lock()
 
     def _lock(self) -> None:
@@ -142,7 +139,7 @@ class Page(QWidget):
             if isinstance(widget, Field):
                 widget.lock(why)
             else:
-                allow(widget, widget.property("usual tip"), why)
+                offer(widget, why)
 
     def _take_session(self) -> None:
         """Clear messages about the previous session."""

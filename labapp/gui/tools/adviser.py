@@ -12,7 +12,7 @@ from labapp.gui.tools import adviser_presenter as presenter
 from labapp.gui.tools.tool import WORKING, ToolWindow, progress_of
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
-from labapp.gui.widgets.labels import heading, wrapping_label
+from labapp.gui.widgets.labels import heading, offer, wrapping_label
 from labapp.gui.widgets.layouts import Group, fill, scrolled
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.sheet import Sheet
@@ -209,9 +209,9 @@ class AdviserWindow(ToolWindow):
             other = presenter.why_not_applied(session, advice, self._sought_for)
             words = presenter.headline(advice)
         self.headline.setText(" ".join(filter(None, (lines, other, words))))
-        self.offer(self.start_button, lines or (WORKING if self.working else ""))
-        self.offer(self.use_button, lines or other or presenter.why_not_usable(session, advice))
-        self.offer(self.save_button, "" if self.files else presenter.NO_ADVICE)
+        offer(self.start_button, lines or (WORKING if self.working else ""))
+        offer(self.use_button, lines or other or presenter.why_not_usable(session, advice))
+        offer(self.save_button, "" if self.files else presenter.NO_ADVICE)
 
     def use(self) -> None:
         """Use the recommended set-up in the session."""

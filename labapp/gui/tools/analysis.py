@@ -13,7 +13,7 @@ from labapp.gui.tools import analysis_presenter as presenter
 from labapp.gui.tools.analysis_presenter import BUDGET, OPENED, PARTS, USUAL
 from labapp.gui.tools.tool import WORKING, ToolWindow, progress_of
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, flush_fields, whole
-from labapp.gui.widgets.labels import heading, show_words, wrapping_label
+from labapp.gui.widgets.labels import heading, offer, show_words, wrapping_label
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 from labapp.studies import SCHEME_NAMES
@@ -235,5 +235,5 @@ class AnalysisWindow(ToolWindow):
         show_words(self.why, why)
         show_words(self.former, presenter.of_former_setup(self.workspace.session, self._of))
         unticked = "" if ticked else "Tick what is to be computed"
-        self.offer(self.start_button, why or unticked or (WORKING if self.working else ""))
-        self.offer(self.save_button, "" if self.files else "There are no results yet: press Run")
+        offer(self.start_button, why or unticked or (WORKING if self.working else ""))
+        offer(self.save_button, "" if self.files else "There are no results yet: press Run")

@@ -15,7 +15,7 @@ from labapp.gui.tools import dynamics_presenter as presenter
 from labapp.gui.tools.tool import WORKING, ToolWindow
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
-from labapp.gui.widgets.labels import allow, heading, wrapping_label
+from labapp.gui.widgets.labels import heading, offer, wrapping_label
 from labapp.gui.widgets.layouts import column_of, hbox
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 FILM_MS = 80
 """Interval of the pictures in the film of a mode."""
 
-PLAY_TIP = "Show one period of this mode as a film; press again to stop"
-FRAME_TIP = "Show the frame of this event in the main window"
 
 CHANGED = "Results or signals have changed since: press Analyse again."
 
@@ -82,8 +80,10 @@ class DynamicsWindow(ToolWindow):
         self.shape = Sheet("Shape and course of the mode")
         self.modes, self.events = CellTable("Modes"), CellTable("Events")
         self.responses = CellTable("Responses")
-        self.play_button = button("Play", PLAY_TIP, self.play)
-        self.frame_button = button("Show the frame", FRAME_TIP, self.show_frame)
+        tip = "Show one period of this mode as a film; press again to stop"
+        self.play_button = button("Play", tip, self.play)
+        tip = "Show the frame of this event in the main window"
+        self.frame_button = button("Show the frame", tip, self.show_frame)
         for table, changed in (
             (self.modes, self._show_mode),
             (self.events, self.show_state),
@@ -301,9 +301,9 @@ class DynamicsWindow(ToolWindow):
         self.words.setText(text)
         working = WORKING if self.working else ""
         drawn = "" if self.drawn is not None else "There are no results yet: press Analyse"
-        self.offer(self.start_button, why or working)
-        self.offer(self.save_button, drawn or working or (CHANGED if changed else ""))
+        offer(self.start_button, why or working)
+        offer(self.save_button, drawn or working or (CHANGED if changed else ""))
         chosen = "" if self.modes.currentRow() >= 0 else "Select a mode in the table"
-        allow(self.play_button, PLAY_TIP, chosen or working)
+        offer(self.play_button, chosen or working)
         chosen = "" if self.events.selectedItems() else "Select an event in the table"
-        allow(self.frame_button, FRAME_TIP, chosen)
+        offer(self.frame_button, chosen)

@@ -19,7 +19,7 @@ from labapp.gui.tools.simulator_presenter import ScenarioPreview
 from labapp.gui.tools.tool import WORKING, ToolWindow, progress_of
 from labapp.gui.views.picture import PictureView, rings
 from labapp.gui.widgets.fields import ChoiceField, flush_fields, whole
-from labapp.gui.widgets.labels import heading, wrapping_label
+from labapp.gui.widgets.labels import heading, offer, wrapping_label
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.simulated.simulate import begin_session, simulate
@@ -192,9 +192,9 @@ class SimulatorWindow(ToolWindow):
         """Enable the actions that are available now."""
         working = WORKING if self.working else ""
         drawn = "" if self.preview is not None else "The first frame of the scenario is not drawn"
-        self.offer(self.start_button, drawn or working)
+        offer(self.start_button, drawn or working)
         written = "" if self.made is not None else "Simulate a recording first"
-        self.offer(self.open_button, written or working)
+        offer(self.open_button, written or working)
 
     def start(self) -> None:
         """Write recording and true values in the background; the folder is complete or absent."""

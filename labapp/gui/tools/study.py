@@ -24,7 +24,7 @@ from labapp.gui.widgets.fields import (
     flush_fields,
     whole,
 )
-from labapp.gui.widgets.labels import heading, show_words, wrapping_label
+from labapp.gui.widgets.labels import heading, offer, show_words, wrapping_label
 from labapp.gui.widgets.layouts import column_of
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.sheet import Sheet
@@ -433,10 +433,10 @@ class StudyWindow(ToolWindow):
         """Enable the actions that are available now."""
         working = WORKING if self.working else ""
         chosen = "" if self.study is not None else "Open a study first, or make one"
-        self.offer(self.start_button, chosen or working)
+        offer(self.start_button, chosen or working)
         selected = "" if self.selected() is not None else "Select a recording in the table"
-        self.offer(self.open_button, selected or working)
-        self.offer(self.page_button, "" if self.summary is not None else "There are no results yet")
+        offer(self.open_button, selected or working)
+        offer(self.page_button, "" if self.summary is not None else "There are no results yet")
 
 
 def _results(path: Path, folder: Path, surfaces: bool) -> StudySummary:

@@ -18,7 +18,7 @@ from labapp.gui.dialogs import ask_folder
 from labapp.gui.tasks import PROBLEM, Control, Task, Tasks
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import FieldForm
-from labapp.gui.widgets.labels import Message, allow
+from labapp.gui.widgets.labels import Message, offer
 from labapp.gui.widgets.layouts import column_of, fill, hbox, scrolled, vbox
 from labapp.simulation.parallel import Progress, low_priority
 
@@ -52,7 +52,6 @@ class ToolWindow(QDialog):
         """Results as files: name → content."""
         self._task: Task | None = None
         self._pressed: QWidget | None = None
-        self._tips: dict[QPushButton, str] = {}
         self.setObjectName(f"tool-{self.key}")
         self.setWindowTitle(self.title)
         self.setWindowFlag(Qt.WindowType.WindowMaximizeButtonHint)
@@ -101,13 +100,8 @@ class ToolWindow(QDialog):
     def add_button(self, words: str, tip: str, do: Callable[[], object]) -> QPushButton:
         """Add a button before the existing ones."""
         made = button(words, tip, do)
-        self._tips[made] = tip
         self.buttons.insertWidget(0, made)
         return made
-
-    def offer(self, pressed: QPushButton, why_not: str) -> None:
-        """Enable one of the buttons below, or disable it and show the reason as its tooltip."""
-        allow(pressed, self._tips[pressed], why_not)
 
     def add_save_button(self, words: str, tip: str) -> None:
         """Add the button that writes `files` to a folder."""
@@ -239,7 +233,7 @@ class ToolWindow(QDialog):
         task, active = self._task, self.working
         self.bar.setVisible(active)
         on_cancel = self.focusWidget() is self.cancel_button
-        self.offer(self.cancel_button, "" if active else "Nothing is under way")
+        offer(self.cancel_button, "" if active else "Nothing is under way")
         self.show_state()
         if on_cancel and not active and self._pressed is not None:
             self._pressed.setFocus()

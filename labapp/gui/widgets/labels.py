@@ -29,10 +29,12 @@ def plain_tip(text: str) -> str:
     return QtGui.Qt.convertFromPlainText(text) if rich else text
 
 
-def allow(widget: QWidget, tip: str, why_not: str) -> None:
-    """Enable a widget, with its tooltip; or disable it, with the reason unless that is empty."""
+def offer(widget: QWidget, why_not: str) -> None:
+    """Enable a widget, with its usual tooltip; or disable it, with the reason as its tooltip."""
+    if widget.property("usual tip") is None:
+        widget.setProperty("usual tip", widget.toolTip())
     widget.setEnabled(not why_not)
-    widget.setToolTip(plain_tip(why_not or tip))
+    widget.setToolTip(plain_tip(why_not or widget.property("usual tip")))
 
 
 def heading(text: str) -> QLabel:

@@ -29,8 +29,8 @@ from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField
 from labapp.gui.widgets.labels import (
     Message,
-    allow,
     heading,
+    offer,
     set_font,
     show_words,
     wrapping_label,
@@ -265,7 +265,8 @@ class BenchCheckPage(Page):
     # --- the panel ----------------------------------------------------------------------------
 
     def _make_panel(self) -> None:
-        self.predict_button = button("Predict ± by pictures", "", self.predict)
+        tip = "Predicted ± of the height of the expected pool, after each set of pictures"
+        self.predict_button = button("Predict ± by pictures", tip, self.predict)
         name = "Predicted ± of the pool's height"
         self.predicted = FullTable(
             name, f"{name}: Ctrl+C copies it", ("After a check with", "±, mm")
@@ -273,7 +274,7 @@ class BenchCheckPage(Page):
         self.predicted_words = wrapping_label()
         tip = "Add pictures of a mirror's dots, taken by the camera in its place"
         self.add_button = button("Add picture…", tip, self._choose)
-        self.remove_button = button("Remove", "Remove the picture from the list", self.remove)
+        self.remove_button = button("Remove", "Remove it from the list", self.remove)
         tip = "Pictures and the mirrors that they show"
         self.list = ReadTable("Pictures of mirrors", tip, ("Picture", "Mirror"))
         self.list.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
@@ -284,8 +285,10 @@ class BenchCheckPage(Page):
         self.mirror_form = MirrorForm(self._selected, self.change)
         self.kind, self.diameter = self.mirror_form.kind, self.mirror_form.diameter
         self.height_field = self.mirror_form.height_field
-        self.check_button = button("Check", "", self.check)
-        self.use_button = button("Apply", "", self.use)
+        tip = "Find the dots' rays and adjust the set-up to the known mirrors"
+        self.check_button = button("Check", tip, self.check)
+        tip = "Measure with the adjusted set-up; undo restores the former one"
+        self.use_button = button("Apply", tip, self.use)
         self.words = wrapping_label()
         self.mirrors_words = heading("Known mirrors, measured")
         tip = (
@@ -364,8 +367,7 @@ class BenchCheckPage(Page):
         lacking = self.locked or (f"Set-up: {to_do}" if to_do else "")
         wrong = next((one.problem for one in self.chosen if one.problem), "")
         why_not = lacking or wrong or ("" if self.chosen else "Add a picture of a mirror first")
-        tip = "Find the dots' rays and adjust the set-up to the known mirrors"
-        allow(self.check_button, tip, why_not)
+        offer(self.check_button, why_not)
         made = self.checked
         if used:
             unusable = "It is in use"
@@ -373,12 +375,9 @@ class BenchCheckPage(Page):
             unusable = "Check the pictures first"
         else:
             unusable = "" if made.usable else "What is wrong must be corrected first"
-        tip = "Measure with the adjusted set-up; undo restores the former one"
-        allow(self.use_button, tip, self.locked or unusable)
-        tip = "Predicted ± of the height of the expected pool, after each set of pictures"
-        allow(self.predict_button, tip, lacking)
-        why_not = self.locked or ("" if self.chosen else "No picture")
-        allow(self.remove_button, "Remove it from the list", why_not)
+        offer(self.use_button, self.locked or unusable)
+        offer(self.predict_button, lacking)
+        offer(self.remove_button, self.locked or ("" if self.chosen else "No picture"))
 
     def _show_picture(self, found: MirrorPicture | None) -> None:
         image = self._selected().image if self.chosen else None

@@ -9,7 +9,7 @@ from PySide6.QtCore import Signal
 from labapp.gui.pages.capture.presenter import Choice, Preview, choice_text, refusal
 from labapp.gui.widgets.buttons import button, check_box
 from labapp.gui.widgets.fields import FieldForm, NumberField, whole
-from labapp.gui.widgets.labels import Message, allow, selectable_label
+from labapp.gui.widgets.labels import Message, offer, selectable_label
 from labapp.gui.widgets.layouts import Group, fill, hbox
 from labapp.session.session import Session
 
@@ -46,7 +46,8 @@ class ImportChoice(Group):
             lambda _: self.edited.emit(),
         )
         self.choice_words = Message(2)
-        self.import_button = button("Import", "", do_import)
+        tip = "Read it once from end to end, and add its frames"
+        self.import_button = button("Import", tip, do_import)
         self.import_button.setDefault(True)
         stop = button("Discard", "Leave it, and see the session's frames", leave)
         self.next_button = button(NEXT, NEXT_TIP, begin_next)
@@ -113,8 +114,7 @@ class ImportChoice(Group):
         wants_own = has_one and measured
         self.import_button.setDefault(not wants_own)
         self.next_button.setDefault(wants_own)
-        tip = "Read it once from end to end, and add its frames"
-        allow(self.import_button, tip, why_not or (MEASURED if wants_own else ""))
+        offer(self.import_button, why_not or (MEASURED if wants_own else ""))
         if preview is not None and choice is not None:
             words = choice_text(preview, choice)
             self.choice_words.setText(f"{words}. {why_not}" if why_not else words)

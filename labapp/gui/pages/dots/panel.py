@@ -29,7 +29,7 @@ from labapp.gui.pages.dots.presenter import (
 from labapp.gui.shell.lead import action_grid
 from labapp.gui.shell.steps import MEASURE_ACTIONS, SETUP_ACTIONS
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, allow, heading, plain_label
+from labapp.gui.widgets.labels import Message, heading, offer, plain_label
 from labapp.gui.widgets.layouts import Group, reveal, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
@@ -48,13 +48,12 @@ class MeasureLead(QStackedWidget):
         for words, names in LEADS:
             self.addWidget(Group(words, action_grid(names, do), 1))
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
-        self._tips = {each: each.toolTip() for each in self.findChildren(QAbstractButton)}
 
     def offer(self, without_setup: bool, why_not: str) -> None:
         """Offer one of the two; disabled if neither is possible."""
         self.setCurrentIndex(int(without_setup))
-        for each, tip in self._tips.items():
-            allow(each, tip, why_not)
+        for each in self.findChildren(QAbstractButton):
+            offer(each, why_not)
 
 
 class DotsPanel(QWidget):

@@ -35,14 +35,12 @@ from labapp.gui.pages.page import Page
 from labapp.gui.tasks import DONE, PROBLEM, Control, Task
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, whole
-from labapp.gui.widgets.labels import Message, allow, heading, keep_room, wrapping_label
+from labapp.gui.widgets.labels import Message, heading, keep_room, offer, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox, scrolled, vbox
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.text import format_bytes, pluralize
-
-OPEN = "Show what was exported in the file manager"
 
 CHANGED = "The scheme has just changed: see what will be written now, and press Export again"
 
@@ -68,7 +66,6 @@ class ExportPage(Page):
         self._said = ""
         self._in_view: int | None = None
         self._boxes: dict[str, QCheckBox] = {}
-        self._tips: dict[str, str] = {}
         self._make_canvas()
         self._make_panel()
         workspace.opened.connect(self._session_opened)
@@ -124,8 +121,8 @@ class ExportPage(Page):
         for key, box in self._boxes.items():
             with QSignalBlocker(box):
                 box.setChecked(key in self.request.ticked and not why)
+            offer(box, why)
             box.setEnabled(not why and (key != "solid" or self.request.has_mesh))
-            box.setToolTip(why or self._tips[key])
         for each in self._tick_buttons:
             each.setEnabled(not why)
 
@@ -137,8 +134,7 @@ class ExportPage(Page):
         writing = self._writing in active
         measuring = self.workspace.measuring is not None
         why_not = "Writing…" if writing else made.why_not
-        tip = "Write all that is ticked; a cancelled export leaves nothing behind"
-        allow(self.export_button, tip, why_not)
+        offer(self.export_button, why_not)
         recording = self.workspace.session.recording
         size = estimated_bytes(
             self.request,
@@ -157,7 +153,7 @@ class ExportPage(Page):
         self.again_button.setEnabled(again and not measuring)
         self.again_button.setText("Measuring…" if measuring else f"Measure {len(made.again)} now")
         unwritten = "" if self.written is not None else "Nothing has been exported yet"
-        allow(self.open_button, OPEN, unwritten)
+        offer(self.open_button, unwritten)
 
     def _session_opened(self) -> None:
         self.written = self.plan = self._in_view = None
@@ -262,7 +258,6 @@ class ExportPage(Page):
             for item in items:
                 box = boxes[item.key]
                 box.setToolTip(item.tip)
-                self._tips[item.key] = item.tip
                 box.setChecked(item.key in USUAL)
                 box.toggled.connect(lambda _: self._ticked())
             self._boxes |= boxes
@@ -330,8 +325,10 @@ class ExportPage(Page):
             self.measure_again,
         )
         keep_room(self.again_button)
-        self.export_button = button("Export", "", self.export)
-        self.open_button = button("Open the folder", OPEN, self.open_folder)
+        tip = "Write all that is ticked; a cancelled export leaves nothing behind"
+        self.export_button = button("Export", tip, self.export)
+        tip = "Show what was exported in the file manager"
+        self.open_button = button("Open the folder", tip, self.open_folder)
         # The buttons are above the text, whose height varies.
         fill(
             self.panel_layout,

@@ -19,7 +19,7 @@ from labapp.gui.views.drawings.cross_hair import CrossHairView
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, allow, plain_label, wrapping_label
+from labapp.gui.widgets.labels import Message, offer, plain_label, wrapping_label
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import RIGHT
@@ -35,8 +35,6 @@ IN_USE = f"{DONE} In the set-up"
 SEVERAL = "The mean of several readings: change them in the table"
 
 NO_PICTURE = "Take a picture of the cross beside a scale, square from above, and load it here."
-
-ADD = "Add these lengths to the table as a further reading"
 
 LEAST_ROWS = 4
 
@@ -165,7 +163,8 @@ class LaserPage(Page):
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
         readings = wrapping_label("Readings, mm: three lines or more")
-        self.use_button, self.applied = button("Apply", "", self.use), Message(2)
+        tip = "Put angle and distance into the set-up; undo restores the former ones"
+        self.use_button, self.applied = button("Apply", tip, self.use), Message(2)
         self.words = wrapping_label()
         self.result = ResultTable("The laser computed from the lengths")
         self.in_use = ResultTable("Laser in use")
@@ -191,7 +190,8 @@ class LaserPage(Page):
         self.scale.set_value(10.0)
         self.scale.edited.connect(lambda _: self._dragged())
         self.lengths = Message(2)
-        self.add_button = button("Add as a reading", ADD, self.add_reading)
+        tip = "Add these lengths to the table as a further reading"
+        self.add_button = button("Add as a reading", tip, self.add_reading)
         self.picture_part = FieldForm(load, self.answer, self.scale, self.lengths, self.add_button)
         return self.picture_part
 
@@ -248,9 +248,7 @@ class LaserPage(Page):
         warnings = [f"⚠ {words}" for words in result.warnings]
         refused = [f"⚠ {result.why_not}"] if result.why_not else []
         self.words.setText("\n".join(refused or warnings or ["✓ The three lengths agree."]))
-        why_not = result.why_not or self.locked
-        tip = "Put angle and distance into the set-up; undo restores the former ones"
-        allow(self.use_button, tip, why_not)
+        offer(self.use_button, result.why_not or self.locked)
         self.applied.setText(IN_USE if presenter.is_in_use(self.session, readings) else "")
         example = f"{result.why_not}. The drawing shows an example"
         words = example if result.found is None else DRAWN_WORDS
@@ -324,7 +322,7 @@ class LaserPage(Page):
 
     def _dragged(self) -> None:
         unmarked = "" if self._cross() is not None else "Place the points on the cross first"
-        allow(self.add_button, ADD, self.locked or unmarked)
+        offer(self.add_button, self.locked or unmarked)
 
 
 def _length_field(column: int) -> NumberField:

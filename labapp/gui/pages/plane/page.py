@@ -24,7 +24,7 @@ from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, allow, plain_label, show_words, wrapping_label
+from labapp.gui.widgets.labels import Message, offer, plain_label, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
@@ -40,8 +40,6 @@ NO_PICTURE = (
 IN_USE = f"{DONE} This calibration is in use"
 
 ADD = "A further picture of the same board, tilted or nearer to a corner of the picture"
-
-FIND = "Look for the dot and the two bars in the picture"
 
 PRINTS = ("imaging_plane_4_inch", *BOARDS)
 """Targets that can be printed: that of the dissertation, and the boards."""
@@ -81,9 +79,8 @@ class PlanePage(Page):
             self._clear()
             if kept is not None:
                 self.take_kept()
-        self.kept_button.setEnabled(kept is not None)
         none = "The session keeps no picture yet: Apply keeps it"
-        self.kept_button.setToolTip("Show what is in use again" if kept else none)
+        offer(self.kept_button, none if kept is None else "")
         self.in_use.set_rows(presenter.in_use(self.session))
         self._follow()
 
@@ -171,7 +168,7 @@ class PlanePage(Page):
     def _make_panel(self) -> None:
         tip = "A picture of the target, taken by the camera in its place"
         load = button("Load picture…", tip, self._choose)
-        self.kept_button = button("Picture in use", "", self.take_kept)
+        self.kept_button = button("Picture in use", "Show what is in use again", self.take_kept)
         self.unit = NumberField(
             "Unit of the axes",
             "mm",
@@ -184,7 +181,8 @@ class PlanePage(Page):
         self.unit.set_value(presenter.UNIT_MM)
         self.unit.edited.connect(lambda _: self._unit_changed())
         self._make_board_fields()
-        self.find_button = button("Find O′ and the axes", FIND, self.find_axes)
+        tip = "Look for the dot and the two bars in the picture"
+        self.find_button = button("Find O′ and the axes", tip, self.find_axes)
         fill(
             self.panel_layout,
             FieldForm(
@@ -226,7 +224,8 @@ class PlanePage(Page):
             tooltip="How pixels map to the plane: a fit to the tick marks, or the three points",
         )
         self.model.edited.connect(self.choose_model)
-        self.use_button, self.applied = button("Apply", "", self.use), Message(2)
+        tip = "Measure with this calibration; undo restores the former one"
+        self.use_button, self.applied = button("Apply", tip, self.use), Message(2)
         help_text = wrapping_label(
             "Drag a point that is not right: O′ to the middle of the dot, the others to the "
             "middles of their bars. P chooses the next one, arrow keys move it by 0.1 px."
@@ -358,7 +357,7 @@ class PlanePage(Page):
             self.model.set_value("homography")
         self.square.setEnabled(is_board and not self.locked)
         no_board = "" if is_board else f"{ADD}: load the one in the plane first"
-        allow(self.add_button, ADD, self.locked or no_board)
+        offer(self.add_button, self.locked or no_board)
         self.applied.setText(IN_USE if presenter.is_in_use(self.session, self.found) else "")
         self._show_residuals()
         self.result.set_rows(result.rows)
@@ -367,11 +366,9 @@ class PlanePage(Page):
         unlike = presenter.size_warnings(self.session, self.view.picture)
         parts = (f"⚠ {words}" for words in (*why_not, *result.warnings, *unlike))
         show_words(self.words, "\n".join(parts))
-        unusable = result.why_not or self.locked
-        tip = "Measure with this calibration; undo restores the former one"
-        allow(self.use_button, tip, unusable)
+        offer(self.use_button, result.why_not or self.locked)
         no_picture = "" if self.view.picture is not None else "Load a picture of the target first"
-        allow(self.find_button, FIND, self.locked or no_picture)
+        offer(self.find_button, self.locked or no_picture)
         for point in self.points:
             point.movable = not self.locked
         self._axes.setVisible(self.found is not None)

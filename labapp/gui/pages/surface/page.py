@@ -53,7 +53,7 @@ from labapp.gui.views.view3d import LOOKS, View3d, as_image
 from labapp.gui.views.view3d_kinds import make_view3d
 from labapp.gui.widgets.buttons import add_action, tool_button
 from labapp.gui.widgets.fields import ChoiceField, NumberField
-from labapp.gui.widgets.labels import Message, allow
+from labapp.gui.widgets.labels import Message, offer
 from labapp.gui.widgets.layouts import column_of, fill, hbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
@@ -75,8 +75,6 @@ FILM_PX = (1280, 720)
 
 SCREEN_DPI = 96.0
 
-COMPARE = "Put two schemes side by side, or show one again"
-FILM = "Write a film (MP4) of all frames, seen as the 3-D view is now"
 NOT_OF_LINES = "Only of patterns of dots: this session is of lines"
 
 GAP_PX = 6
@@ -226,8 +224,10 @@ class SurfacePage(Page):
             self.save_picture,
         )
         self.save.setShortcut(QKeySequence("Ctrl+Shift+P"))
-        self.film = tool_button("Film…", FILM, self.save_film)
-        self.comparing = tool_button("Compare", COMPARE, self._toggle_compare, _Toggle())
+        tip = "Write a film (MP4) of all frames, seen as the 3-D view is now"
+        self.film = tool_button("Film…", tip, self.save_film)
+        tip = "Put two schemes side by side, or show one again"
+        self.comparing = tool_button("Compare", tip, self._toggle_compare, _Toggle())
         self.comparing.setCheckable(True)
         self.saved = Message(1)
         self.saved.setMinimumWidth(ANSWER_PX)
@@ -276,8 +276,8 @@ class SurfacePage(Page):
         self.side.show(self.surface_state)
         self._show_options()
         lines = self.session.has_lines
-        for each, what in ((self.comparing, COMPARE), (self.film, FILM)):
-            allow(each, what, NOT_OF_LINES if lines else "")
+        for each in (self.comparing, self.film):
+            offer(each, NOT_OF_LINES if lines else "")
         if lines and self.comparing.isChecked():
             self.comparing.setChecked(False)
             self._show_compare()
