@@ -9,8 +9,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from datetime import datetime
+from dataclasses import dataclass
 from typing import Literal
 
 Kind = Literal["note", "warning", "loss"]
@@ -26,7 +25,6 @@ class Event:
     kind: Kind
     words: str
     """One sentence for the operator."""
-    at: datetime = field(default_factory=lambda: datetime.now().astimezone())
 
     def __str__(self) -> str:
         return f"{self.source}: {self.words}"

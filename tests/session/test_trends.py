@@ -89,16 +89,17 @@ def test_spectrum_gives_frequency_and_amplitude_of_an_oscillation() -> None:
     count = 240
     time_s = np.arange(count) / RATE_HZ
     height = 0.3 + 0.05 * time_s + 0.02 * np.sin(2 * np.pi * 12.5 * time_s)
-    result = spectrum(trend(overview(height), "height_mm"))
+    course = trend(overview(height), "height_mm")
+    assert course.timed
+    result = spectrum(course)
     frequency, amplitude = result.peak
     assert frequency == pytest.approx(12.5, abs=0.01)
     assert amplitude == pytest.approx(0.02, rel=0.02)
-    assert result.timed
     assert result.frequency[-1] == pytest.approx(RATE_HZ / 2)
     assert result.resolution == pytest.approx(2 * RATE_HZ / count)
-    slow = spectrum(trend(overview(height, np.full(count, np.nan)), "height_mm"))
-    assert slow.peak[0] == pytest.approx(12.5 / RATE_HZ)
-    assert not slow.timed
+    course = trend(overview(height, np.full(count, np.nan)), "height_mm")
+    assert not course.timed
+    assert spectrum(course).peak[0] == pytest.approx(12.5 / RATE_HZ)
 
 
 def test_spectrum_uses_the_longest_uninterrupted_part() -> None:

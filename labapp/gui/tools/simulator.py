@@ -40,7 +40,6 @@ class SimulatorWindow(ToolWindow):
         """The displayed scenario; None until its first frame is drawn."""
         self.made: tuple[Scenario, Path] | None = None
         """The last written scenario, and its folder."""
-        self._own: Path | None = None
         self._proposed = ""
         self._seed: int | None = None
         self._turn = threading.Lock()
@@ -111,7 +110,6 @@ class SimulatorWindow(ToolWindow):
 
     def take(self, path: Path) -> None:
         """Choose the operator's own scenario."""
-        self._own = path
         self.scenario.set_choices(presenter.choices(path))
         self.scenario.set_value(str(path))
         self.show_scenario()

@@ -64,7 +64,6 @@ class FrameLine:
     doubtful: bool = False
     """Whether another correspondence explains its dots nearly as well."""
     dots: int | None = None
-    orientation: str = ""
     rows_allow: bool | None = None
     """Whether the shape of the reflected rows allows its correspondence (§7.1); None: unknown."""
     version: str = ""
@@ -176,7 +175,6 @@ def _frame_line(session: SessionContents, scheme: str, number: int, time_s: floa
         corrected=found.correction is not None,
         doubtful=is_doubtful(found),
         dots=None if found.dots is None else len(found.dots),
-        orientation="" if found.match is None else found.match.orientation,
         rows_allow=None
         if found.match is None
         else match_row_shapes(found.match).allows(found.match.orientation),

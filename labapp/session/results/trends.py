@@ -116,8 +116,6 @@ class Spectrum(ReadOnlyArrays):
     """
     amplitude: FloatArray
     """Amplitude of a sine of that frequency, shape (k,), in the measure's unit."""
-    timed: bool
-    """Whether frequencies are in Hz."""
     first: int
     last: int
     """First and last frame of the series."""
@@ -241,7 +239,6 @@ def spectrum(course: Trend) -> Spectrum:
     return Spectrum(
         frequency=frequency[1:],
         amplitude=amplitude[1:],
-        timed=course.timed,
         first=int(course.frame[members[0]]),
         last=int(course.frame[members[-1]]),
         count=count,

@@ -56,12 +56,7 @@ class PredictedError(ReadOnlyArrays):
     setup_mm: float
     """Sum of these contributions with their correlations."""
     dots: int
-    blocked: int
-    off_plane: int
-    lost: int
-    """Number of visible dots; of rays from the pool that the torch blocks; of reflections that miss
-    the plane; of rays that meet the pool again.
-    """
+    """Number of visible dots."""
 
     @property
     def random_mm(self) -> float:
@@ -105,9 +100,6 @@ def predict_error(
         parameters_mm=np.zeros(len(QUANTITIES)),
         setup_mm=0.0,
         dots=int(seen.visible.sum()),
-        blocked=int((seen.lit & seen.blocked).sum()),
-        off_plane=int((seen.lit & ~seen.blocked & ~seen.on_plane).sum()),
-        lost=int((seen.lit & ~seen.blocked & seen.hits_again).sum()),
     )
     if counted.dots < LEAST_DOTS:
         return counted
@@ -140,7 +132,7 @@ class _Model:
         self.peak_mm = size.height_mm if convex else size.depth_mm
         self.rim = pool.boundary_mm(RIM_POINTS)[:, :2]
         rays = project_rays(rig.laser, rig.pattern)
-        self.ground = ground = rays.landing_mm[..., :2]
+        ground = rays.landing_mm[..., :2]
         corners = np.vstack([self.points[:, :2], self.rim, self.peak_xy])
         self.basis = basis_around(corners, rays, settings.knot_mm)
         self.stiffness = CORRELATED_MM2 / settings.jerk**2
