@@ -54,6 +54,7 @@ class Field(QWidget):
         editor.setAccessibleName(f"{label}, {unit}" if unit else label)
         self._tooltip = tooltip
         self._refusal = self._fault = ""
+        self._emitted: Any = None
         self.unit = plain_label(unit)
         self.problem = wrapping_label()
         self.problem.hide()
@@ -84,10 +85,12 @@ class Field(QWidget):
         self._refusal = words
         self._show_problem()
 
-    def _enter(self, value: object) -> None:
-        """Emit an edit."""
-        self.refuse("")
-        self.edited.emit(value)
+    def _enter(self, value: Any) -> None:
+        """Emit an edit if it changed the value."""
+        if value != self._emitted:
+            self._emitted = value
+            self.refuse("")
+            self.edited.emit(value)
 
     def _show_problem(self) -> None:
         words = self._refusal or self._fault
@@ -140,7 +143,6 @@ class NumberField(Field):
         self.lowest, self.highest, self.step = lowest, highest, step
         self.decimals, self.optional = decimals, optional
         self._value: float | None = None
-        self._emitted: float | None = None
         self._typed = False
         self._box.line.textEdited.connect(self._note_typing)
         self._box.stepped.connect(self._step)
@@ -229,9 +231,7 @@ class NumberField(Field):
 
     def _emit_change(self) -> None:
         self._pause.stop()
-        if self._value != self._emitted:
-            self._emitted = self._value
-            self._enter(self._value)
+        self._enter(self._value)
 
 
 class _NumberBox(QAbstractSpinBox):
@@ -309,9 +309,7 @@ class TextField(Field):
 
     def flush(self) -> None:
         """Finish a current edit, as leaving the field does."""
-        if self.value() != self._emitted:
-            self._emitted = self.value()
-            self._enter(self._emitted)
+        self._enter(self.value())
 
     def _set_locked(self, locked: bool) -> None:
         if isinstance(self._edit, QLineEdit):
@@ -377,7 +375,7 @@ class ChoiceField(Field):
         self._combo.installEventFilter(self)
         self._emitted = ""
         self.set_choices(choices)
-        self._combo.activated.connect(self._activated)
+        self._combo.activated.connect(lambda _: self._enter(self.value()))
 
     def value(self) -> str:
         """Key of the choice; empty if nothing is chosen."""
@@ -406,11 +404,6 @@ class ChoiceField(Field):
             event.ignore()
             return True
         return super().eventFilter(watched, event)
-
-    def _activated(self, _: int) -> None:
-        if self.value() != self._emitted:
-            self._emitted = self.value()
-            self._enter(self._emitted)
 
 
 class FieldForm(QWidget):
