@@ -335,19 +335,15 @@ class System:
     def solve_from(self, unknown: FloatArray) -> Adjustment:
         """Iterate from initial unknowns to the adjustment."""
         scale = max(1.0, robust_sigma(self.residuals(unknown)))
-        for _ in range(ROUNDS):
-            # A large scale first tolerates gross errors; the loss tightens as residuals shrink.
-            if scale == 1.0:
-                break
-            unknown = self.minimise(unknown, scale, FEW_ITERATIONS)
-            before, scale = scale, max(1.0, robust_sigma(self.residuals(unknown)))
-            if scale > SETTLED * before:
-                break
-        for _ in range(ROUNDS):
-            unknown = self.minimise(unknown, scale, MOST_ITERATIONS)
-            before, scale = scale, max(1.0, robust_sigma(self.residuals(unknown)))
-            if scale > SETTLED * before:
-                break
+        # A large scale first tolerates gross errors; the loss tightens as residuals shrink.
+        for most in (FEW_ITERATIONS, MOST_ITERATIONS):
+            for _ in range(ROUNDS):
+                if most == FEW_ITERATIONS and scale == 1.0:
+                    break
+                unknown = self.minimise(unknown, scale, most)
+                before, scale = scale, max(1.0, robust_sigma(self.residuals(unknown)))
+                if scale > SETTLED * before:
+                    break
         return self.adjustment(unknown, scale)
 
     def refitted_with_more_free(self, made: Adjustment) -> Adjustment:

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 import scipy
 
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration, with_ones
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 Model = Literal["three points", "affine", "homography"]
@@ -313,7 +313,7 @@ def _fit(
     size = np.abs(plane_mm).max()
     plane = plane_mm / size
     matrix = np.eye(3)
-    matrix[:2] = np.linalg.lstsq(_with_ones(plane), image_px, rcond=None)[0].T
+    matrix[:2] = np.linalg.lstsq(with_ones(plane), image_px, rcond=None)[0].T
 
     def off(step: FloatArray) -> FloatArray:
         residual = _seen(_with(matrix, free, step), plane) - image_px
@@ -361,13 +361,13 @@ def _calibration(matrix: FloatArray) -> ImageCalibration:
 
 
 def _seen(matrix: FloatArray, plane: FloatArray) -> FloatArray:
-    projected = _with_ones(plane) @ matrix.T
+    projected = with_ones(plane) @ matrix.T
     return np.asarray(projected[:, :2] / projected[:, 2:])
 
 
 def _jacobian(matrix: FloatArray, plane: FloatArray) -> FloatArray:
     """∂(u, v)/∂(the first 8 entries of the matrix), shape (2n, 8)."""
-    ones = _with_ones(plane)
+    ones = with_ones(plane)
     seen, weight = _seen(matrix, plane), ones @ matrix[2]
     rows = np.zeros((len(plane), 2, 8))
     rows[:, 0, :3] = rows[:, 1, 3:6] = ones
@@ -380,7 +380,3 @@ def _with(matrix: FloatArray, free: tuple[int, ...], step: FloatArray) -> FloatA
     flat = matrix.ravel().copy()
     flat[list(free)] += step
     return flat.reshape(3, 3)
-
-
-def _with_ones(points: FloatArray) -> FloatArray:
-    return np.column_stack([points, np.ones(len(points))])

@@ -254,3 +254,8 @@ def _apply(matrix: FloatArray, points: FloatArray) -> FloatArray:
     made[..., 0] = (a * first + b * second + c) / scale
     made[..., 1] = (d * first + e * second + f) / scale
     return made
+
+
+def with_ones(points: FloatArray) -> FloatArray:
+    """Homogeneous coordinates of points, shape (n, 2): another column of ones."""
+    return np.column_stack([points, np.ones(len(points))])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration, with_ones
 from labapp.core.geometry.rig import ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import INDEX, POINTS, QUANTITIES, AxisPoints
 from labapp.core.values import FloatArray, ReadOnlyArrays
@@ -158,9 +158,9 @@ def moved_calibration(
     base = calibration.undistorted
     percent = calibration.distortion_percent + float(offset[_DISTORTION])
     points_px = base.to_image(_axis_points_mm(axes))
-    true = _with_ones(base.ideal_px(points_px))
+    true = with_ones(base.ideal_px(points_px))
     moved = base.ideal_px(points_px + offset[POINTS].reshape(3, 2))
-    back = np.linalg.solve(_with_ones(moved), true).T
+    back = np.linalg.solve(with_ones(moved), true).T
     stretch = np.diag([*(1.0 + offset[_AXES] / [axes.x_mm, axes.z_mm]), 1.0])
     return ImageCalibration.distorted(
         np.asarray(stretch @ base.matrix @ back),
@@ -209,7 +209,3 @@ def _axis_points_mm(axes: AxisPoints) -> FloatArray:
 
 def _half_mm(plane: ImagingPlane) -> FloatArray:
     return np.array([plane.width_mm, plane.height_mm]) / 2
-
-
-def _with_ones(points: FloatArray) -> FloatArray:
-    return np.column_stack([points, np.ones(len(points))])

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import label
+from scipy.ndimage import find_objects, label
 
 from labapp.core.lines.fit import LEAST_LINES
 from labapp.core.lines.frame import LineFrame
@@ -215,35 +215,29 @@ def _from_below_zero(change: BoolArray, turn: FloatArray) -> BoolArray:
 
     That is judged from the last known values, as the sign of a small turn is often unknown.
     """
-    parts, count = label(change)
-    kept = []
-    for part in range(1, count + 1):
-        before = turn[: np.argmax(parts == part) + 1]
+    result = change.copy()
+    for (span,) in find_objects(label(change)[0]):
+        before = turn[: span.start + 1]
         before = before[np.isfinite(before)][-SLOPING_FRAMES:]
-        if len(before) < SLOPING_FRAMES or before.min() < 0:
-            kept.append(part)
-    return np.asarray(np.isin(parts, kept) & change)
+        result[span] = len(before) < SLOPING_FRAMES or before.min() < 0
+    return result
 
 
 def _with_corners(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolArray:
     """Adjust the ends of changes to corners of the values: constant outside, a line inside."""
-    parts, count = label(change)
     result = np.zeros(len(change), bool)
-    for part in range(1, count + 1):
-        first, last = np.flatnonzero(parts == part)[[0, -1]]
-        begin = _corner(values, on, int(first))
-        end = _corner(values[::-1], on[::-1], len(values) - 1 - int(last))
+    for (span,) in find_objects(label(change)[0]):
+        begin = _corner(values, on, span.start)
+        end = _corner(values[::-1], on[::-1], len(values) - span.stop)
         result[begin : len(values) - end] = True
     return result
 
 
 def _ramps(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolArray:
     """Adjust the ends of changes by fitting ramps between two levels."""
-    parts, count = label(change)
     result = np.zeros(len(change), bool)
-    for part in range(1, count + 1):
-        first, last = np.flatnonzero(parts == part)[[0, -1]]
-        begin, end = _ramp(values, on, int(first), int(last) + 1)
+    for (span,) in find_objects(label(change)[0]):
+        begin, end = _ramp(values, on, span.start, span.stop)
         result[_gap_before(begin, on & np.isfinite(values)) : end] = True
     return result
 

@@ -124,36 +124,32 @@ def widened(mask: BoolArray, rings: int) -> BoolArray:
     return wider
 
 
-@compiled(_mask)
-def amid(lit: BoolArray) -> BoolArray:
-    """Mask of rays that are lit or between lit ones in a row or column, shape (rows, columns)."""
+@inner
+def _spanned(lit: BoolArray, ends: int) -> BoolArray:
+    """Mask of rays from the first to the last lit one of a row or column, without so many ends."""
     rows, columns = lit.shape
     mask = np.zeros((rows, columns), np.bool_)
     for i in range(rows):
         at = np.flatnonzero(lit[i])
-        if len(at):
-            mask[i, at[0] : at[-1] + 1] = True
+        if len(at) > ends:
+            mask[i, at[0] + ends : at[-1] + 1 - ends] = True
     for j in range(columns):
         at = np.flatnonzero(lit[:, j])
-        if len(at):
-            mask[at[0] : at[-1] + 1, j] = True
+        if len(at) > ends:
+            mask[at[0] + ends : at[-1] + 1 - ends, j] = True
     return mask
+
+
+@compiled(_mask)
+def amid(lit: BoolArray) -> BoolArray:
+    """Mask of rays that are lit or between lit ones in a row or column, shape (rows, columns)."""
+    return _spanned(lit, 0)
 
 
 @compiled(_mask)
 def between(lit: BoolArray) -> BoolArray:
     """Mask of rays with lit ones on both sides in their row or column, shape (rows, columns)."""
-    rows, columns = lit.shape
-    mask = np.zeros((rows, columns), np.bool_)
-    for i in range(rows):
-        at = np.flatnonzero(lit[i])
-        if len(at) > 1:
-            mask[i, at[0] + 1 : at[-1]] = True
-    for j in range(columns):
-        at = np.flatnonzero(lit[:, j])
-        if len(at) > 1:
-            mask[at[0] + 1 : at[-1], j] = True
-    return mask
+    return _spanned(lit, 1)
 
 
 @compiled(_f2, _f3, _f2, _f3, _f1)
