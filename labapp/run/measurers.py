@@ -337,10 +337,9 @@ class RecordingMeasurer:
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
-        return self._in_processes(list(frames)) if self.pools else self._here(frames)
-
-    def _here(self, frames: Iterable[int]) -> Generator[FrameResult]:
-        yield from map(self.with_rows, self.measured(frames))
+        if self.pools:
+            return self._in_processes(list(frames))
+        return (self.with_rows(result) for result in self.measured(frames))
 
     def measured(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames in this process, without the rows of the tables."""

@@ -212,12 +212,8 @@ class Live:
     # --- in threads of their own --------------------------------------------------------------
 
     def _begin_work(self) -> None:
-        works: list[_Work] = [
-            ("dots", partial(newest_of, self._to_show), self._find_quickly, SHOW_S, 1.0),
-            ("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S, 1.0),
-        ]
-        for work in works:
-            self._begin(work)
+        self._begin(("dots", partial(newest_of, self._to_show), self._find_quickly, SHOW_S, 1.0))
+        self._begin(("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S, 1.0))
 
     def _begin_measuring(self, feed: Feed) -> None:
         if self.setup is None or self._settings is None:

@@ -48,18 +48,15 @@ def first_points(shape: tuple[int, int], unit_mm: float) -> PlaneCalibration:
     rows, columns = shape
     side = 0.8 * min(rows, columns)
     u, v = 0.1 * columns, 0.9 * rows
-    arms = np.array([sum(DESIGN.x_units), sum(DESIGN.z_units)]) / 2 / DESIGN.x_units[1]
-    return _of_units(
-        PlaneCalibration(
-            origin_px=(u, v),
-            x_axis_px=(u + float(arms[0]) * side, v),
-            x_axis_mm=1.0,
-            z_axis_px=(u, v - float(arms[1]) * side),
-            z_axis_mm=1.0,
-            sigma_px=(UNPLACED, UNPLACED, UNPLACED),
-            threshold=0.0,
-        ),
-        unit_mm,
+    x_arm, z_arm = (sum(units) / 2 for units in (DESIGN.x_units, DESIGN.z_units))
+    return PlaneCalibration(
+        origin_px=(u, v),
+        x_axis_px=(u + x_arm / DESIGN.x_units[1] * side, v),
+        x_axis_mm=x_arm * unit_mm,
+        z_axis_px=(u, v - z_arm / DESIGN.x_units[1] * side),
+        z_axis_mm=z_arm * unit_mm,
+        sigma_px=(UNPLACED, UNPLACED, UNPLACED),
+        threshold=0.0,
     )
 
 
@@ -83,11 +80,6 @@ def with_unit(found: Calibration, unit_mm: float) -> Calibration:
         return found
     x_mm = sum(DESIGN.x_units) / 2 * unit_mm
     return found.with_scale(x_mm / found.x_axis_mm)
-
-
-def _of_units(found: PlaneCalibration, unit_mm: float) -> PlaneCalibration:
-    x_mm, z_mm = (sum(units) / 2 * unit_mm for units in (DESIGN.x_units, DESIGN.z_units))
-    return replace(found, x_axis_mm=x_mm, z_axis_mm=z_mm)
 
 
 def places(found: Calibration) -> tuple[Place, Place, Place]:
