@@ -118,12 +118,10 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("center_y_mm", "Y of the pool's centre"),
         Column("peak_x_mm", "X where the surface is farthest from the work piece"),
         Column("peak_y_mm", "Y where the surface is farthest from the work piece"),
-        Column("width_sigma_mm", f"standard uncertainty of the width, {SIGMA_OF}"),
-        Column("length_sigma_mm", f"standard uncertainty of the length, {SIGMA_OF}"),
-        Column("height_sigma_mm", f"standard uncertainty of the height, {SIGMA_OF}"),
-        Column("depth_sigma_mm", f"standard uncertainty of the depth, {SIGMA_OF}"),
-        Column("area_sigma_mm2", f"standard uncertainty of the area, {SIGMA_OF}"),
-        Column("volume_sigma_mm3", f"standard uncertainty of the volume, {SIGMA_OF}"),
+        *(
+            Column(f"{size}_sigma_{unit}", f"standard uncertainty of the {size}, {SIGMA_OF}")
+            for size, unit in (name.split("_") for name in measures.SIZES)
+        ),
         Column("are_inner_mm", "average reflection error of inside points"),
         Column("mre_inner_mm", "maximum reflection error of inside points"),
         Column("own_are_mm", "irs, ers: average reflection error of the scheme's own points"),

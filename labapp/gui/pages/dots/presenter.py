@@ -123,10 +123,7 @@ def shown(session: Session, frame: int, found: DetectedDots | None) -> DotsState
 
 def needs_dots(session: Session, frame: int) -> bool:
     """Whether dots of a frame must be detected, because the session has none."""
-    if session.correction(frame) is not None:
-        return False
-    result = _result(session, frame)[0]
-    return result is None or not _automatic(result, _by(session))
+    return shown(session, frame, None).origin == "looked for"
 
 
 def _result(session: Session, frame: int) -> tuple[Result | None, str]:

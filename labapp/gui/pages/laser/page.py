@@ -111,15 +111,11 @@ class LaserPage(Page):
 
     def use(self) -> None:
         """Use the resulting laser in the rig."""
-        readings = self.readings()
-        picture = self._from_picture
-        lengths_mm, fan_deg, settings = (
-            readings.lengths_mm,
-            readings.fan_angle_deg,
-            readings.settings,
-        )
+        readings, picture = self.readings(), self._from_picture
         if self.workspace.attempt(
-            lambda session: session.calibrate_laser(*lengths_mm, fan_deg, picture, settings)
+            lambda session: session.calibrate_laser(
+                *readings.lengths_mm, readings.fan_angle_deg, picture, readings.settings
+            )
         ):
             words = "Applied to the set-up; undo restores the former laser"
             self.workspace.notified.emit(words, False)
