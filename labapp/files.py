@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import json
 import os
 import secrets
 import shutil
@@ -116,6 +117,15 @@ def read_limited(path: Path, largest: int, wanted: str) -> bytes:
     if len(content) > largest:
         raise InputError(path, "size", f"more than {largest} bytes", f"{wanted}, at most {largest}")
     return content
+
+
+def is_of_labapp(path: Path) -> bool:
+    """Whether a file is JSON that names labapp as its program."""
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and content.get("program") == "labapp"
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from labapp.export.formats import SURFACE_FORMATS
 from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SPACING_MM, known_nodes, open_mesh, solid_mesh
 from labapp.export.tables import TABLES, csv_header, sigma_of, table_rows
-from labapp.files import as_bytes, only_writer, write_all, write_atomically
+from labapp.files import as_bytes, is_of_labapp, only_writer, write_all, write_atomically
 from labapp.text import now, unescaped_csv_text
 from labapp.version import VERSION
 
@@ -280,7 +280,7 @@ def _earlier_results(folder: Path) -> list[Path]:
     if (folder / RUN_FILE).is_symlink():  # `write_atomically` would follow it
         raise InputError(folder, RUN_FILE, "is a link", "a folder whose files are its own")
     ours = [path for path in folder.iterdir() if RESULT_NAMES.fullmatch(path.name)]
-    if ours and not _is_run(folder / RUN_FILE):
+    if ours and not is_of_labapp(folder / RUN_FILE):
         raise InputError(
             folder,
             "results",
@@ -288,11 +288,3 @@ def _earlier_results(folder: Path) -> list[Path]:
             "an empty folder, or one with an earlier run (it is replaced)",
         )
     return sorted(ours, key=lambda path: path.name != "measures.csv")
-
-
-def _is_run(path: Path) -> bool:
-    try:
-        run = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(run, dict) and run.get("program") == "labapp"

@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 
 from labapp.config.setup import read_setup
 from labapp.errors import PATH, InputError, os_errors_as_input, require
-from labapp.files import as_bytes, write_file
+from labapp.files import as_bytes, is_of_labapp, write_file
 from labapp.run.runner import select_frames
 from labapp.run.study.plan import StudyPlan, StudyRecording, read_study
 from labapp.run.study.status import RecordingStatus, State, StudyProgress, Tasks
@@ -77,17 +77,9 @@ class Study:
         self.folder = Path(folder).absolute()
         """Folder of the results."""
         with os_errors_as_input(self.folder, "folder", OWN_FOLDER):
-            if self.folder.exists() and not self._is_ours():
+            has_files = self.folder.exists() and any(self.folder.iterdir())
+            if has_files and not is_of_labapp(self.folder / MARKER):
                 raise InputError(self.folder, "folder", "holds something else", OWN_FOLDER)
-
-    def _is_ours(self) -> bool:
-        if not any(self.folder.iterdir()):
-            return True
-        marker = self.folder / MARKER
-        try:
-            return bool(json.loads(marker.read_bytes())["program"] == "labapp")
-        except (OSError, ValueError, TypeError, KeyError, RecursionError):
-            return False
 
     # --- running --------------------------------------------------------------------------------
 
