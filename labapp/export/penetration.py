@@ -376,10 +376,10 @@ def frame_features(result: FrameResult, features: Collection[str]) -> WeldSeries
     return weld_series("", time_s, columns, tuple(features))
 
 
-def joined(parts: Iterable[WeldSeries], name: str = "") -> WeldSeries:
+def joined(parts: Iterable[WeldSeries]) -> WeldSeries:
     """Concatenate series."""
     columns = zip(*(list(vars(one).values())[1:] for one in parts), strict=True)
-    return WeldSeries(name, *(np.concatenate(column) for column in columns))
+    return WeldSeries("", *(np.concatenate(column) for column in columns))
 
 
 # --- ONNX ---------------------------------------------------------------------------------------

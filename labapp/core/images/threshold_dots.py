@@ -106,7 +106,7 @@ def block_threshold_dots(frame: Frame, settings: BlockThresholdSettings | None =
     # the small noise regions that the filter removes.
     labels, boxes = _components(binary)
     if len(boxes) == 0:
-        return _dots(labels, 0, grey, frame.dtype)
+        return _dots(binary, grey, frame.dtype)
     size = boxes[:, cv2.CC_STAT_AREA]
     kept = size > size.mean() / settings.size_divisor
     binary = np.concatenate([[False], kept])[labels].astype(np.uint8)
@@ -116,8 +116,7 @@ def block_threshold_dots(frame: Frame, settings: BlockThresholdSettings | None =
     width = float((boxes[kept, cv2.CC_STAT_WIDTH] - 1).mean())
     binary = cv2.dilate(binary, np.ones((_odd(settings.dilation * length), 1), np.uint8))
     binary = cv2.dilate(binary, np.ones((1, _odd(settings.dilation * width)), np.uint8))
-    labels, boxes = _components(binary)
-    return _dots(labels, len(boxes), grey, frame.dtype)
+    return _dots(binary, grey, frame.dtype)
 
 
 def wavelet_dots(frame: Frame, settings: WaveletSettings | None = None) -> Dots:
@@ -152,9 +151,7 @@ def wavelet_dots(frame: Frame, settings: WaveletSettings | None = None) -> Dots:
     binary: Frame = (enhanced > mean + settings.offset_sigma * noise).astype(np.uint8)
     binary = cv2.medianBlur(binary, settings.median_px)
     square = np.ones((settings.closing_px, settings.closing_px), np.uint8)
-    binary = cv2.erode(cv2.dilate(binary, square), square)
-    labels, boxes = _components(binary)
-    return _dots(labels, len(boxes), grey, frame.dtype)
+    return _dots(cv2.erode(cv2.dilate(binary, square), square), grey, frame.dtype)
 
 
 def _enhance(grey: FloatArray, noise: float, settings: WaveletSettings) -> FloatArray:
@@ -235,10 +232,8 @@ def _local_background(grey: FloatArray, dark: BoolArray, window_px: int = 41) ->
     return np.where(weight > 1e-6, light / np.maximum(weight, 1e-6), overall)
 
 
-def _dots(
-    labels: npt.NDArray[np.int32], count: int, grey: FloatArray, dtype: np.dtype[Any]
-) -> Dots:
-    """Measure each labelled region (Eq. 5-14).
+def _dots(binary: Frame, grey: FloatArray, dtype: np.dtype[Any]) -> Dots:
+    """Measure each connected region (Eq. 5-14).
 
     The position is the mean of the region's pixels. Its standard uncertainty along u is
 
@@ -249,6 +244,8 @@ def _dots(
     both detectors if a region is one dot; it does not account for merged dots. The size is that of
     the light within the region, which is a third too small if the region is tight.
     """
+    labels, boxes = _components(binary)
+    count = len(boxes)
     if count == 0:
         return Dots(*(np.empty(0) for _ in range(7)))
     v, u = np.nonzero(labels)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from datetime import datetime
 from pathlib import Path
 
 from PySide6.QtWidgets import QCheckBox, QLabel, QTabWidget, QVBoxLayout, QWidget
@@ -34,7 +33,7 @@ from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick, ticked
 from labapp.session.session import Session
-from labapp.text import local_time
+from labapp.text import local_time, now
 
 ENTRIES = {entry.key: entry for _, entries in RIG for entry in entries}
 
@@ -208,9 +207,8 @@ class SetupPage(Page):
         return page
 
     def _tick(self, item: str, on: bool) -> None:
-        now = datetime.now().astimezone().isoformat(timespec="seconds")
         self.workspace.attempt(
-            lambda session: session.set_record(tick(session.record, item, on, now))
+            lambda session: session.set_record(tick(session.record, item, on, now()))
         )
 
     def _bench(self) -> QWidget:

@@ -164,16 +164,12 @@ def sigma_entry(entry: Entry) -> Entry | None:
         key,
         f"{entry.label} ±",
         entry.unit,
-        f"Standard uncertainty of “{entry.label}”; {_assumed_words(key, entry.unit)}",
+        f"Standard uncertainty of “{entry.label}”; empty: {ASSUMED[key]:g} {entry.unit} is assumed",
         0,
         90 if entry.unit == "°" else 10_000,
         max(entry.step / 10, least),
         entry.decimals,
     )
-
-
-def _assumed_words(key: str, unit: str) -> str:
-    return f"empty: {ASSUMED[key]:g} {unit} is assumed"
 
 
 POOL = (
@@ -261,7 +257,6 @@ def shown(session: Session) -> SetupState:
             others.append("The imaging plane is not calibrated: that is step Imaging plane.")
         else:
             others.append(f"{problem.field}: {words}")
-    unique = tuple(dict.fromkeys(others))
     return SetupState(
         values=values,
         sigmas=sigmas,
@@ -272,7 +267,7 @@ def shown(session: Session) -> SetupState:
         status=status,
         problems=problems,
         missing=frozenset(missing & values.keys()),
-        others=unique,
+        others=tuple(dict.fromkeys(others)),
         record=session.record,
     )
 
