@@ -123,9 +123,7 @@ class DotsPanel(QWidget):
         for words, button in self.buttons.items():
             why = unmet_need[words]
             focused |= bool(why) and button.hasFocus()
-            button.setEnabled(not why)
-            tip = button.defaultAction().toolTip()
-            button.setToolTip(f"{why}. {tip}" if why else tip)
+            offer(button, f"{why}. {button.defaultAction().toolTip()}" if why else "")
         return focused
 
     def lock_sites(self, dots: str, reference: str) -> None:

@@ -20,7 +20,7 @@ from labapp.gui.widgets.labels import (
     Message,
     heading,
     keep_room,
-    plain_tip,
+    offer,
     show_words,
     wrapping_label,
 )
@@ -128,10 +128,8 @@ class SurfacePanel:
             why = "Measuring is under way"
         else:
             why = "No session is open" if session is None else why_not_measurable(session)
-        for each in self._tips:
-            each.setEnabled(not why)
-            tip = self._tips[each]
-            each.setToolTip(plain_tip(f"{tip}. {why}" if why else tip))
+        for each, tip in self._tips.items():
+            offer(each, f"{tip}. {why}" if why else "")
         self.progress.setVisible(task is not None)
         self.cancel.setVisible(task is not None)
         self.again.setVisible(self._stale and task is None)
