@@ -18,6 +18,13 @@ def printable(text: str) -> str:
     return "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
 
 
+def parser_words(error: Exception) -> str:
+    """Return what a parser found wrong, without terms of Python."""
+    if isinstance(error, RecursionError):
+        return "is nested too deeply"
+    return str(error) or "cannot be read"
+
+
 class InputError(Exception):
     """Invalid input, with a description of valid input.
 

@@ -89,7 +89,7 @@ def regular_size(path: Path) -> int:
     try:
         found = path.stat()
     except ValueError as error:  # a NUL byte in the name
-        raise OSError(errno.EINVAL, str(error)) from error
+        raise OSError(errno.EINVAL, "has a NUL byte in its name") from error
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, "is a folder")
     if not stat.S_ISREG(found.st_mode):

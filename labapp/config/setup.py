@@ -44,7 +44,7 @@ from labapp.core.geometry.uncertainty import (
     RigUncertainty,
     covariance_of,
 )
-from labapp.errors import InputError, os_errors_as_input
+from labapp.errors import InputError, os_errors_as_input, parser_words
 from labapp.files import write_atomically
 
 if TYPE_CHECKING:  # see `labapp.config.bench_check`
@@ -310,7 +310,7 @@ def _parsed(text: str, path: str | os.PathLike[str]) -> tomlkit.TOMLDocument:
     try:
         return tomlkit.parse(text)
     except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError) as error:
-        raise InputError(path, "syntax", error, A_SETUP) from error
+        raise InputError(path, "syntax", parser_words(error), A_SETUP) from error
 
 
 def pattern_values(pattern: DotPattern) -> dict[str, object]:

@@ -13,7 +13,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from labapp.errors import InputError
+from labapp.errors import InputError, parser_words
 from labapp.files import read_limited
 
 LARGEST_MM = 10_000.0
@@ -62,7 +62,7 @@ def _syntax(text: str, error: Exception, wanted: str) -> tuple[str, str]:
     place = _PLACE.search(str(error))
     lines = text.splitlines()
     if place is None or not 0 < int(place[1]) <= len(lines):
-        return str(error), wanted
+        return parser_words(error), wanted
     line = lines[int(place[1]) - 1].strip()
     shown_line = f"line {place[1]} is “{line}”" if line else f"line {place[1]} is empty"
     if number := _DECIMAL_COMMA.search(line):

@@ -23,7 +23,7 @@ from labapp.core.dynamics.static_maps import MOST_POINTS, GaussianMap, LinearMap
 from labapp.core.dynamics.weld_series import LONGEST_MEMORY, MOST_HELD, Orders, WeldSeries
 from labapp.core.surface.measures import WITH_SIGMA, sigma_name
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
+from labapp.errors import InputError, parser_words
 from labapp.export.features import needs_extra, weld_series
 from labapp.export.frame_result import FrameResult
 from labapp.files import as_bytes, read_limited, write_file
@@ -93,7 +93,7 @@ def read_model(path: str | os.PathLike[str]) -> PenetrationModel:
     try:
         read = json.loads(read_limited(path, LARGEST, WANTED))
     except (ValueError, RecursionError) as error:
-        raise InputError(path, "syntax", error, WANTED) from error
+        raise InputError(path, "syntax", parser_words(error), WANTED) from error
     file = _Fields(path, read)
     file.get("program", one_of("labapp"))
     file.get("format", Rule(f"{FORMAT}, of this labapp", lambda value: value == FORMAT))

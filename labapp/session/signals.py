@@ -197,7 +197,8 @@ def _hostile(path: Path, wanted: str) -> Iterator[None]:
     except OSError as error:
         raise InputError(path, "file", error.strerror or error, wanted) from error
     except Exception as error:  # malformed bytes can raise anything in the reader
-        raise InputError(path, "content", str(error) or type(error).__name__, wanted) from error
+        words = str(error) if isinstance(error, ValueError) and str(error) else "cannot be decoded"
+        raise InputError(path, "content", words, wanted) from error
 
 
 def _read_tdms(path: Path) -> Signals:

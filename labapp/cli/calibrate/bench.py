@@ -10,7 +10,7 @@ import typer
 from labapp.cli.shared import NOTHING_MEASURED, check_distinct, check_target, warned
 from labapp.errors import InputError
 from labapp.files import write_file
-from labapp.text import csv_text
+from labapp.text import csv_text, pluralize
 
 if TYPE_CHECKING:
     from labapp.config.setup import Setup
@@ -96,7 +96,7 @@ def _checked(
         raise InputError("PICTURE", "pictures", "none", "one or more, or --predict")
     check_distinct(pictures)
     if len(mirrors) != len(pictures):
-        counts = f"{len(mirrors)} for {len(pictures)} pictures"
+        counts = f"{len(mirrors)} for {pluralize(len(pictures), 'picture')}"
         raise InputError("--mirror", "mirrors", counts, "one for each picture, in their order")
     for key in free:
         if key not in suspect_keys():

@@ -11,6 +11,7 @@ from labapp.cli.calibrate.bench import mirror_picture
 from labapp.cli.shared import NOTHING_MEASURED, check_distinct, check_target, warned
 from labapp.errors import InputError
 from labapp.files import write_file
+from labapp.text import pluralize
 
 CONTRADICTING = 3.0
 """Ratio of the pictures' disagreement to that expected from dot noise which is an error."""
@@ -87,7 +88,7 @@ def _check_options(
 
     check_distinct(pictures)
     if len(height) != len(pictures) or len(set(height)) < LEAST_PICTURES:
-        counts = f"{len(set(height))} for {len(pictures)} pictures"
+        counts = f"{len(set(height))} for {pluralize(len(pictures), 'picture')}"
         raise InputError("--height", "heights", counts, "one for each picture, two that differ")
     if not all(abs(one) <= HIGHEST_MM for one in height):
         raise InputError("--height", "height", height, f"heights to {HIGHEST_MM:g} mm")

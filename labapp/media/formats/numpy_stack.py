@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
+from labapp.errors import InputError, parser_words
 from labapp.media.base import GreyImage, to_grey
 from labapp.media.formats.stored import (
     StoredFrames,
@@ -111,7 +111,12 @@ def _header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtyp
         shape, columns_first, kind = read(file)
     except Exception as error:
         # The header is the text of a Python dict: damage raises nearly every kind of error.
-        raise InputError(path, "header", error, "that of a NumPy array") from error
+        raise InputError(
+            path,
+            "header",
+            parser_words(error) if isinstance(error, zipfile.BadZipFile) else "is damaged",
+            "that of a NumPy array",
+        ) from error
     if kind.kind not in "buif" or kind.itemsize > 8:
         raise InputError(path, "type", f"'{kind.str}'", NUMBERS)
     return shape, columns_first, kind

@@ -104,7 +104,9 @@ def unpack(blob: object, kind: Any = Any) -> Any:
         tree = json.loads(content[4 : 4 + length])
         value = _Reader(memoryview(content)[4 + length :]).read(tree)
     except UNREADABLE as error:
-        raise Damaged(f"it cannot be read: {error}") from error
+        is_plain = isinstance(error, ValueError | CannotMeasure)
+        reason = error if is_plain else "it is not as labapp writes it"
+        raise Damaged(f"it cannot be read: {reason}") from error
     if not is_a(value, kind):
         raise Damaged(f"it is a {type(value).__name__}")
     return value

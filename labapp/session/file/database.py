@@ -402,7 +402,7 @@ def _lock(path: Path) -> FileLock:
             path,
             "session",
             "is open in another program",
-            "to be closed there first; it can be opened read-only",
+            "a session that no other program writes: close it there, or open it read-only",
         ) from error
     except (OSError, NotImplementedError) as error:
         raise InputError(
