@@ -233,7 +233,7 @@ def _length(readings: npt.ArrayLike, name: str, settings: LaserCalibrationSettin
         raise ValueError(f"{name} is empty: give at least one reading in mm")
     for value in values:
         if not 0.0 < value < LONGEST_MM:
-            allowed = f"a reading is a number of mm above 0 and below {LONGEST_MM:g}"
+            allowed = f"a reading is a positive number of mm, below {LONGEST_MM:g}"
             raise ValueError(f"{name} = {value:g}: {allowed}")
     mean, count = float(values.mean()), values.size
     # Averaging reduces the rounding error of readings only if they scatter beyond the resolution.

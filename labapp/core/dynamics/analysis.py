@@ -126,7 +126,7 @@ def analyse(
     """
     time = surfaces.time_s
     if len(time) < FEWEST:
-        raise ValueError(f"only {len(time)} of at least {FEWEST} frames have a surface")
+        raise ValueError(f"{len(time)} of the frames have a surface; at least {FEWEST} are needed")
     if np.ptp(time) > LONGEST * np.median(np.diff(time)):
         raise ValueError(f"their times range over {np.ptp(time):g} s: too long for their rate")
     modes = bessel_modes(surfaces, scale_sigma=scale_sigma, band_hz=settings.band_hz)

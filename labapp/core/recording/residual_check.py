@@ -281,7 +281,7 @@ def judge_setup(
     if rig.uncertainty is None:
         return SetupVerdict(False, "the set-up is taken as exact")
     if len(samples) < FEWEST:
-        few = f"only {len(samples)} of at least {FEWEST} frames have a surface"
+        few = f"too few frames have a surface: {len(samples)}, and at least {FEWEST} are needed"
         return SetupVerdict(False, few)
     ray, residual = _by_ray(samples, (rig.pattern.rows, rig.pattern.columns))
     parts = np.array_split(np.arange(len(samples)), PARTS)

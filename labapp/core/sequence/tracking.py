@@ -18,6 +18,7 @@ import numpy as np
 
 from labapp.core.images import band_pass_kernels
 from labapp.core.match import Trial, missing_share
+from labapp.core.matching.checks.unexplained import refuse_contradicted
 from labapp.core.matching.checks.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.label_growth import OUTLIER_SPACINGS, OUTLIER_TIMES
 from labapp.core.matching.match_rays import match_of_pairs
@@ -110,7 +111,7 @@ def track(
     for _ in range(MOST_LEFT_OUT):
         fit.settle()
         covariance = fit.covariance_around()
-        classes, level = _with_level(prior, fit, covariance)
+        classes, known_rays, level = _with_level(prior, fit, covariance)
         wrong = _unsupported(fit, covariance, classes, level)
         if len(wrong) == 0:
             break
@@ -122,6 +123,7 @@ def track(
     pool = fitted_pool(fit.rounds, level, observed.rig, observed.plane_mm[dots])
     if not pool.residual_rms_mm < WORSE * prior.cold_residual_mm:
         raise TrackLost("the surface no longer explains the dots")
+    refuse_contradicted(known_rays, pool)
     paths = fit.paths()
     is_seen = _reference_is_seen(observed, paths, off)
     if not is_seen and prior.unseen >= HELD:
@@ -387,8 +389,10 @@ def _unsupported(fit: _Fit, covariance: FloatArray, classes: RayClasses, level: 
     return unsupported(fit.observed, fitted)
 
 
-def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayClasses, Level]:
-    """Classify the rays, and shift the surface to the level that follows from them."""
+def _with_level(
+    prior: Prior, fit: _Fit, covariance: FloatArray
+) -> tuple[RayClasses, KnownRays, Level]:
+    """Classify the rays, and shift the surface to the level that follows from the known ones."""
     observed, paths = fit.observed, fit.paths()
     found = classify_rays(observed, fit.labels, paths)
     ray_states = certain_states(observed, found.ray_states, paths, lambda some: covariance[some])
@@ -402,7 +406,7 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     search = LevelSearch(known_rays, near, prior.drop_is_free, RAISED_MM)
     level = fit.rounds.run(fit.settings.rounds, SETTLED_MM, search=search)
     fit.check_settled()
-    return RayClasses(ray_states, found.missed, found.stray), level
+    return RayClasses(ray_states, found.missed, found.stray), known_rays, level
 
 
 def _check_explained(classes: RayClasses, limits: MatchSettings, dots: int, rays: int) -> None:
