@@ -112,7 +112,7 @@ def test_setup_wrong_within_its_uncertainty_does_not_prevent_a_match(kind: str, 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [303, 314])
 def test_dark_rays_inside_the_boundary_alone_do_not_contradict_it(seed: int) -> None:
-    """The torch hides several dots at the rim; no lit ray lands outside."""
+    """Several rays side by side have no dot, but no lit ray lands outside."""
     rig, seen, pool = draw("concave", seed, 0.05, 12)
     found = measure_pool(pool, seen, with_setup_errors(rig, seed, 0.0))
     assert (found.status, found.wrong) == ("ok", 0)

@@ -186,13 +186,11 @@ class KnownRays(ReadOnlyArrays):
 
         The surface is at that level, and its rear is fixed. A constant is omitted.
         """
-        from labapp.core.surface.kernels import level_kernels, spline_kernels
+        from labapp.core.surface.kernels import level_kernels
 
-        there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
-        slope = there[1:].T
-        inside = level.height_inside(there[0], slope, self.landing_mm, self.laser_mm)
+        height, slope, inside = self.surface_there(basis, coefficients, level)
         return level_kernels.negative_log_evidence(
-            there[0],
+            height,
             slope,
             self.ray_states,
             self.spacing_mm,
@@ -200,6 +198,19 @@ class KnownRays(ReadOnlyArrays):
             self.missing,
             level_kernels.BLURS,
         )
+
+    def surface_there(
+        self, basis: SplineBasis, coefficients: FloatArray, level: Level
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Height of a surface where the rays land, its gradient, and its height over the boundary.
+
+        Shapes (m,), mm, (m, 2), and (m,), mm, as `Level.height_inside`.
+        """
+        from labapp.core.surface.kernels import spline_kernels
+
+        there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
+        height, slope = there[0], there[1:].T
+        return height, slope, level.height_inside(height, slope, self.landing_mm, self.laser_mm)
 
 
 @dataclass(frozen=True)
