@@ -562,6 +562,15 @@ def test_detect_writes_its_columns(labapp: Run, tmp_path: Path) -> None:
     assert stdout.startswith(f"{len(rows)} dots, ")
 
 
+def test_detect_does_not_write_through_a_link_to_another_kind(labapp: Run, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "dots.csv").symlink_to("notes.txt")
+    code, _, stderr = labapp("detect", SAMPLE / "recording.avi", "--out", tmp_path / "dots.csv")
+    assert code == 2
+    assert "dots.csv: --out" in stderr
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
 @pytest.mark.parametrize("options", [("--detector", "block-threshold"), ("--rows", "rows")])
 def test_detect_with_the_methods_of_the_dissertation(
     labapp: Run, tmp_path: Path, options: tuple[str, str]

@@ -331,6 +331,8 @@ def test_warnings_of_a_recording_are_printed(labapp: Run, tmp_path: Path) -> Non
         (["stack.npy", "--frames", "9:"], "stack.npy: frames: 9:"),
         (["stack.npy", "--frame-rate", "nan"], "--frame-rate"),
         (["stack.npy", "--frame-rate", "0"], "stack.npy: frame rate: 0.0"),
+        (["stack.npy", "--frame-rate", "1e-320"], "stack.npy: frame rate: 1e-320"),
+        (["stack.npy", "--frame-rate", "1e308"], "stack.npy: frame rate: 1e+308"),
     ],
 )
 def test_failed_import_changes_nothing(

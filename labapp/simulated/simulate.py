@@ -78,7 +78,10 @@ def _check_replaceable(out: Path) -> None:
         found = f"holds {foreign[0]}" if foreign else f"holds no {SCENARIO}"
         raise InputError(out, "folder", found, OWN_FOLDER)
     setup = out / "setup.toml"
-    if setup.exists() and setup.read_text("utf-8") != read_scenario(out / SCENARIO, frames=1).setup:
+    if (
+        setup.exists()
+        and setup.read_text("utf-8", "replace") != read_scenario(out / SCENARIO, frames=1).setup
+    ):
         raise InputError(out, setup.name, f"is not that of {SCENARIO}: it may be yours", OWN_FOLDER)
 
 

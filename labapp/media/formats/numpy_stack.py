@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import FloatArray
-from labapp.errors import InputError, parser_words
+from labapp.errors import InputError
 from labapp.media.base import GreyImage, to_grey
 from labapp.media.formats.stored import (
     StoredFrames,
@@ -114,7 +114,7 @@ def _header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtyp
         raise InputError(
             path,
             "header",
-            parser_words(error) if isinstance(error, zipfile.BadZipFile) else "is damaged",
+            error if isinstance(error, zipfile.BadZipFile) else "is damaged",
             "that of a NumPy array",
         ) from error
     if kind.kind not in "buif" or kind.itemsize > 8:
