@@ -95,10 +95,16 @@ def test_advice_equals_that_of_the_command_and_can_be_undone(
     code, _, err = labapp("advise", question, "--quick", "--out", tmp_path / "command")
     assert code == 0, err
     names = sorted(path.name for path in (tmp_path / "command").iterdir())
+    assert sorted(path.name for path in (tmp_path / "window").iterdir()) == names
+    names.remove("advise.json")
     assert names == ["advice.csv", "advice.md", "advice.png", "patterns.csv", "setup.toml"]
     for name in names:
         content = (tmp_path / "window" / name).read_bytes()
         assert content == (tmp_path / "command" / name).read_bytes(), name
+    (tmp_path / "window" / "setup.toml").write_text("calibrated", "utf-8")
+    adviser.save(tmp_path / "window")
+    assert (tmp_path / "window" / "setup.toml").read_text("utf-8") == "calibrated"
+    assert "setup.toml" in adviser.message.text()
     click(adviser.use_button)
     found, place = session.setup.rig, adviser.advice.best.place
     assert found.laser == Laser(26.0, 40.0)

@@ -55,7 +55,7 @@ NUMBERS = (
 class AdviserWindow(ToolWindow):
     """Asks for pools and limits, searches a set-up, and offers it to the session."""
 
-    key = "adviser"
+    key, command = "adviser", "advise"
     title = "Configuration adviser"
 
     def __init__(self, sessions: Files, window: QWidget) -> None:

@@ -36,7 +36,7 @@ CHANGED = "Results or signals have changed since: press Analyse again."
 class DynamicsWindow(ToolWindow):
     """Analyses the change of the session's pool over the recording, and shows the results."""
 
-    key = "dynamics"
+    key, command = "dynamics", "dynamics"
     title = "Pool over time"
 
     def __init__(self, sessions: Files, window: QWidget) -> None:

@@ -13,6 +13,7 @@ from PySide6.QtGui import QCloseEvent
 from PySide6.QtWidgets import QDialog, QHBoxLayout, QProgressBar, QPushButton, QVBoxLayout, QWidget
 
 from labapp.errors import os_errors_as_input
+from labapp.export.owned_files import write_owned
 from labapp.files import write_file
 from labapp.gui.dialogs import ask_folder
 from labapp.gui.tasks import PROBLEM, Control, Task, Tasks
@@ -41,7 +42,11 @@ class ToolWindow(QDialog):
 
     key = ""
     title = ""
-    """Name in code, and name for the operator."""
+    command = ""
+    """Name in code, name for the operator, and the command whose unchanged files are replaced.
+
+    Without a command all files of the same names are replaced, as ``labapp analyze`` does.
+    """
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
         super().__init__(window)
@@ -213,6 +218,9 @@ class ToolWindow(QDialog):
         def write() -> Path:
             with os_errors_as_input(folder, "folder", "one that can be written"):
                 folder.mkdir(parents=True, exist_ok=True)
+            if self.command:
+                write_owned(folder, self.command, self.files)
+                return folder
             for name, content in self.files.items():
                 write_file(folder / name, content)
             return folder
