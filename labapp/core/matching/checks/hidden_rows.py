@@ -24,7 +24,7 @@ it, whose ratio changes little on a smooth surface."""
 AHEAD, FEW, AHEAD_FEW = 11.0, 4, 25.0
 """Labels must cost less by the first than with a hidden row, whose dots do not count as missed, or
 by the last if at most `FEW` dots are beyond the gap; in units of χ². Of labels one row off, nine in
-ten led by less, or cost more; of right labels, those of 6 in 1,000 pools with a dip, and of 2 in 84
+ten led by less, or cost more; of right labels, those of 7 in 1,000 pools with a dip, and of 2 in 84
 of all kinds."""
 
 
