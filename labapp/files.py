@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import io
 import json
 import os
@@ -117,6 +118,12 @@ def read_limited(path: Path, largest: int, wanted: str) -> bytes:
     if len(content) > largest:
         raise InputError(path, "size", f"more than {largest} bytes", f"{wanted}, at most {largest}")
     return content
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def is_of_labapp(path: Path) -> bool:

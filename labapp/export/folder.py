@@ -6,7 +6,6 @@ then is an earlier export replaced, and only if it is unchanged: other files are
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -41,7 +40,7 @@ from labapp.export.rendering.studio import PICTURE_PX, drawing_errors, drawing_p
 from labapp.export.results import SURFACES, surface_files
 from labapp.export.summary import Summary
 from labapp.export.tables import TABLES, csv_header, csv_rows, frame_tables
-from labapp.files import as_bytes, beside, only_writer
+from labapp.files import as_bytes, beside, only_writer, sha256_of
 from labapp.media import GreyImage
 from labapp.system import sync_folder
 from labapp.text import SIGMA_OF, now
@@ -251,7 +250,7 @@ def verify_export(folder: str | os.PathLike[str]) -> list[str]:
             elif there[name].stat().st_size != file.size:
                 size = there[name].stat().st_size
                 problems.append(f"{name} has {size} bytes instead of {file.size}")
-            elif _sha256(there[name]) != file.sha256:
+            elif sha256_of(there[name]) != file.sha256:
                 problems.append(f"{name} was changed")
     return problems
 
@@ -454,12 +453,7 @@ def _synced(path: Path) -> str:
     """Flush a file to disk, and return its SHA-256."""
     with path.open("rb+") as file:  # Windows can only flush files opened for writing
         os.fsync(file.fileno())
-    return _sha256(path)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return sha256_of(path)
 
 
 @contextmanager

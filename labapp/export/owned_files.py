@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from labapp.errors import InputError, os_errors_as_input
-from labapp.files import as_bytes, read_limited, write_file
+from labapp.files import as_bytes, read_limited, sha256_of, write_file
 from labapp.text import now
 from labapp.version import VERSION
 
@@ -48,7 +48,9 @@ def check_owned(folder: Path, command: str, names: Collection[str] = ()) -> None
         if name not in recorded:
             found = f"is there, and labapp {command} did not write it"
             raise InputError(folder, name, found, expected)
-        if recorded[name] != _sha256(path):
+        with os_errors_as_input(path, "file", "one that can be read"):
+            has_changed = sha256_of(path) != recorded[name]
+        if has_changed:
             found = f"has changed since labapp {command} wrote it"
             raise InputError(folder, name, found, expected)
 
@@ -100,8 +102,3 @@ def _recorded(folder: Path, command: str) -> dict[str, str]:
     if any(Path(name).name != name for name in names):  # no path of a record is followed
         raise InputError(path, "files", "holds a path", expected)
     return names
-
-
-def _sha256(path: Path) -> str:
-    with os_errors_as_input(path, "file", "one that can be read"), path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

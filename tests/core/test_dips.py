@@ -77,7 +77,7 @@ def test_rows_crossing_at_the_absent_dot_are_not_shifted(seed: int) -> None:
     pool = egg(6.0, 2.73, 4.46, 0.18, (-0.08, -0.37), (Dent(0.065, 0.68, (-0.215, 1.29)),))
     got = measure_pool(pool, see(pool, np.random.default_rng(seed), sigma_px=0.06))
     assert got.wrong == 0
-    assert got.status in {"ambiguous-rows", "no-match", "ok"}
+    assert got.status in {"ambiguous-rows", "ok"}
 
 
 def test_rows_are_ambiguous_if_dots_beside_the_absent_one_have_no_ray() -> None:

@@ -55,7 +55,7 @@ def test_row_beyond_a_hidden_one_gets_no_wrong_rays(kind: str, seed: int) -> Non
     seen = without(see(pool, np.random.default_rng(seed), rig=rig), axis=0, line=1)
     with pytest.raises(CannotMeasure) as caught:
         matched(seen, rig)
-    assert caught.value.status in {"ambiguous-rows", "no-match"}
+    assert caught.value.status == "ambiguous-rows"
 
 
 def test_dots_beyond_the_outermost_labels_tell_of_a_hidden_row() -> None:
@@ -118,7 +118,7 @@ def test_labels_that_close_a_gap_are_ambiguous(
 def test_lit_rays_outside_the_boundary_tell_of_hidden_dots(
     fault: str, kind: str, seed: int
 ) -> None:
-    """Each was once measured 18 to 22 % too low, off by 3.3 to 4.1 σ."""
+    """Each was once measured 18 to 23 % too low, off by 3.3 to 4.1 σ."""
     assert faults.measured(fault, kind, seed).status == "no-match"
 
 

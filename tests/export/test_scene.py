@@ -9,10 +9,10 @@ import pytest
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.surface import FlatSurface
-from labapp.export.heights import between_points, difference_at, profile, sigma_at
 from labapp.export.rendering import drawing as draws
 from labapp.export.rendering import scene as scenes
 from labapp.export.rendering.axes import round_ticks
+from labapp.export.rendering.heights import between_points, difference_at, profile, sigma_at
 from labapp.export.rendering.scene import difference_scene, rays_of, scene_of
 from labapp.export.rendering.studio import Studio
 from tests.scenes import BENCH_RIG

@@ -8,7 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from labapp.core.matching.checks.hidden_rows import refuse_hidden_rows
-from labapp.core.matching.checks.unexplained import MOST_SCATTERED, any_explains, refuse_unexplained
+from labapp.core.matching.checks.unexplained import (
+    MOST_SCATTERED,
+    any_explains,
+    refuse_contradicted,
+    refuse_unexplained,
+)
 from labapp.core.matching.checks.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open, unconfirmed
 from labapp.core.matching.hypothesis import (
@@ -33,6 +38,7 @@ from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
+from labapp.core.surface.level import KnownRays
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
 from labapp.core.values import CannotMeasure, IntArray
@@ -125,6 +131,9 @@ def decide(
     best = supported(observed, best, fit_settings)
     _refuse_hidden_marker(observed, best)
     refuse_hidden_rows(observed, best, fit_settings)
+    known = KnownRays.of(observed.rig, best.ray_states, best.pool.surface.basis, 0.0)
+    sigma = best.pool.height_sigma_mm(known.landing_mm)
+    refuse_contradicted(replace(known, height_sigma_mm=sigma), best.pool)
     freed = holes_left_open(observed, best, fit_settings, settings.margin)
     if freed:
         best = _without(observed, best, unconfirmed(freed[0], best.labels), fit_settings)

@@ -12,8 +12,8 @@ from labapp.core.match import Match
 from labapp.core.surface.mesh import surface_mesh
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
-from labapp.export.heights import between_points, difference_at
 from labapp.export.meshes import drawn_spacing, known_part
+from labapp.export.rendering.heights import between_points, difference_at
 
 EXAGGERATION = 3.0
 """Default vertical exaggeration, as pools are flat."""

@@ -24,7 +24,7 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from labapp.errors import InputError
-from labapp.export.heights import profile, sigma_at
+from labapp.export.rendering.heights import profile, sigma_at
 from labapp.export.rendering.paper import Paper
 from labapp.export.rendering.scene import DIFFERENCE_MAP
 from labapp.export.rendering.studio import Studio

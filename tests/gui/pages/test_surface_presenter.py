@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from labapp.core.values import CannotMeasure
-from labapp.export.heights import profile
+from labapp.export.rendering.heights import profile
 from labapp.export.rendering.scene import DIFFERENCE_MAP
 from labapp.gui.pages.surface import comparison, presenter
 from labapp.gui.pages.surface.presenter import Options

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 
@@ -38,6 +36,12 @@ as its dot may be false or missing. Where the dots beyond a line were hidden, 8 
 were not rejected otherwise exceeded both, among them 4 of the 5 whose height was off by over 3 σ.
 None did of 82 rendered frames of all kinds, and of 140 with 5 % of the dots missing and 12 false
 ones. Without the second limit pools with a few dark rays side by side were rejected."""
+
+NO_BOUNDARY = (
+    "no boundary of the best surface separates the rays that came back from those that did not: "
+    "is the set-up correct, and does nothing hide dots?"
+)
+"""Reason for ``no-match`` if rays near the boundary contradict it."""
 
 NOTHING_EXPLAINS = "no surface explains the reflected dots"
 """Reason for ``no-match`` if most of the dots have no ray."""
@@ -115,9 +119,8 @@ def refuse_unexplained(
             f"{_counted(best.missed_count, 'ray')} without a dot among {best.label_count} pairs"
             f"{_doubt_of_setup(observed, best)}",
         )
-    rays = KnownRays.of(observed.rig, best.ray_states, best.pool.surface.basis, 0.0)
-    sigma = best.pool.height_sigma_mm(rays.landing_mm)
-    refuse_contradicted(replace(rays, height_sigma_mm=sigma), best.pool)
+    if best.pool.level.ray_count and best.pool.level.disagreement_bits > CONTRADICTED_BITS:
+        raise CannotMeasure("no-match", NO_BOUNDARY)
 
 
 def refuse_contradicted(rays: KnownRays, pool: FittedPool) -> None:
@@ -135,11 +138,7 @@ def refuse_contradicted(rays: KnownRays, pool: FittedPool) -> None:
     bits = pool.level.disagreement_bits if pool.level.ray_count else 0.0
     by_lit, by_dark = _contradictions(rays, pool)
     if bits > CONTRADICTED_BITS or (by_lit > BY_LIT and by_lit + by_dark > CONTRADICTED):
-        raise CannotMeasure(
-            "no-match",
-            "no boundary of the best surface separates the rays that came back from those that "
-            "did not: is the set-up correct, and does nothing hide dots?",
-        )
+        raise CannotMeasure("no-match", NO_BOUNDARY)
 
 
 def _contradictions(rays: KnownRays, pool: FittedPool) -> tuple[float, float]:

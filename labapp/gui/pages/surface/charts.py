@@ -8,7 +8,7 @@ from PySide6.QtCore import QPointF, QSignalBlocker, Qt, Signal
 
 from labapp.core.surface.boundary import Boundary
 from labapp.core.values import FloatArray
-from labapp.export.heights import Profile
+from labapp.export.rendering.heights import Profile
 from labapp.gui.pages.surface.presenter import error_scale
 from labapp.gui.views.chart import Chart
 from labapp.text import HEIGHT_SIGMA_OF

@@ -30,8 +30,8 @@ from PySide6.QtWidgets import (
 
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.errors import InputError
-from labapp.export.heights import profile, sigma_at
 from labapp.export.rendering.drawing import Camera, Direction
+from labapp.export.rendering.heights import profile, sigma_at
 from labapp.export.rendering.paper import Paper, paper_picture
 from labapp.gui.dialogs import ask_save
 from labapp.gui.pages.page import Page

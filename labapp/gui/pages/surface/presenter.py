@@ -16,7 +16,7 @@ from labapp.core.schemes import scheme_words
 from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
-from labapp.export.heights import Profile
+from labapp.export.rendering.heights import Profile
 from labapp.export.rendering.scene import Colour, Scene, rays_of, scene_of
 from labapp.gui.digits import ResultRow, round_factor
 from labapp.session.results.measured import Overview, Result, scheme_name
