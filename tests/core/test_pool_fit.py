@@ -231,6 +231,13 @@ def test_boundary_is_open_without_dark_rays(match: Match) -> None:
     )
 
 
+def test_boundary_is_open_with_two_dark_rays(match: Match) -> None:
+    dark = np.flatnonzero(match.ray_states.ravel() < 0)
+    ray_states = match.ray_states.copy()
+    ray_states.flat[dark[2:]] = 0
+    assert rejected_status(replace(match, ray_states=ray_states)) == "open-boundary"
+
+
 def test_boundary_is_open_where_the_rear_is_not_visible(match: Match) -> None:
     ray_states = match.ray_states.copy()
     ray_states[:9] = 0

@@ -7,7 +7,7 @@ from numba import types
 
 from labapp.core.compiled import compiled, inner
 from labapp.core.images.band_pass_kernels import next_apart, two_nearest
-from labapp.core.surface.kernels.ray_kernels import behind_torch
+from labapp.core.surface.kernels.ray_kernels import behind_torch, stopped_by_far_side
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 _f1, _f2, _f3 = (types.Array(types.float64, n, "A", readonly=True) for n in (1, 2, 3))
@@ -15,6 +15,7 @@ _uncertain = types.Tuple((_f2, _f3))  # type: ignore[no-untyped-call]
 _i1, _i2 = (types.Array(types.int64, n, "A", readonly=True) for n in (1, 2))
 _mask = types.Array(types.boolean, 2, "A", readonly=True)
 _paths = _view = types.UniTuple(_f2, 3)  # type: ignore[no-untyped-call]
+_surface = types.Tuple((_f2, _f1))  # type: ignore[no-untyped-call]
 
 
 @inner
@@ -220,10 +221,11 @@ def sure_pairs(
     return sure, prediction[sure]
 
 
-@compiled(_i2, _mask, _paths, _f2, _f2, _view, _f1)
+@compiled(_i2, _mask, _surface, _paths, _f2, _f2, _view, _f1)
 def classify_rays(
     labels: IntArray,
     without_dot: BoolArray,
+    surface: tuple[FloatArray, FloatArray],
     paths: tuple[FloatArray, FloatArray, FloatArray],
     rays: FloatArray,
     dots: FloatArray,
@@ -238,6 +240,8 @@ def classify_rays(
         Index of each ray's dot, negative if it has none, shape (rows, columns).
     without_dot
         Mask of the rays that are known to have no dot, shape (rows, columns).
+    surface
+        Its grid and coefficients.
     paths
         Reflection points of the rays, row by row, shape (R, 3), slopes of the surface there, shape
         (R, 2), and computed dots, shape (R, 2); NaN if unknown.
@@ -246,25 +250,19 @@ def classify_rays(
     view
         Homography and limits of the view, the last three arguments of `within_view`.
     limits
-        Height of the tip of the electrode, mm, and distance below which dots merge, mm.
+        Height of the tip of the electrode, distance below which dots merge, and distance from the
+        edge of the view within which a predicted dot may be out of view, mm.
 
     Returns
     -------
     ray_states, missed, stray
         See `ray_classes.RayClasses`; the states have shape (R,).
     """
-    (points, slopes, plane), (tip, resolution) = paths, limits
+    (points, slopes, plane), (tip, resolution, near_edge) = paths, limits
     is_lit = labels >= 0
     lit, amid_lit, dotless = is_lit.ravel(), amid(is_lit).ravel(), without_dot.ravel()
     known = np.flatnonzero(np.isfinite(plane[:, 0]))
     shown = plane[known]
-    blocked = behind_torch(points[known], rays[known], slopes[known], tip)
-    seen = within_view(shown, np.zeros_like(shown), view[0], view[1], view[2]) & ~blocked
-
-    among = np.flatnonzero(amid_lit[known] & ~dotless[known])
-    unlit = among[seen[among] & ~lit[known[among]]]
-    apart = two_nearest(shown[unlit], shown[among])[0][:, 1]
-    missed = known[unlit[apart >= resolution]]
     unlabelled = np.ones(len(dots), np.bool_)
     for label in labels.ravel():
         if label >= 0:
@@ -276,12 +274,24 @@ def classify_rays(
         around = around[next_apart(shown[around]) < resolution]
         stray = stray[two_nearest(candidates, shown[around])[0][:, 0] > resolution]
 
-    ray_states = np.zeros(len(plane), np.int64)
-    unlit = np.flatnonzero(seen & ~(amid_lit | dotless)[known])
-    spacing = next_apart(shown)[unlit]
+    known_paths = points[known], rays[known], slopes[known]
+    free = ~behind_torch(*known_paths, tip)
+    outside = free & ~(amid_lit | dotless)[known]
+    spacing = next_apart(shown)
     # A stray dot near a prediction may be the dot of a ray that seems dark.
-    away = two_nearest(shown[unlit], candidates)[0][:, 0]
-    ray_states[known[unlit[(spacing >= resolution) & (away >= spacing)]]] = -1
+    outside &= (spacing >= resolution) & (two_nearest(shown, candidates)[0][:, 0] >= spacing)
+    next_to_lit = outside & widened(is_lit, 1).ravel()[known]
+    next_to_lit &= within_view(shown, np.full_like(shown, near_edge), view[0], view[1], view[2])
+    free &= ~stopped_by_far_side(surface, *known_paths, lit[known], next_to_lit)
+    seen = free & within_view(shown, np.zeros_like(shown), view[0], view[1], view[2])
+
+    among = np.flatnonzero(amid_lit[known] & ~dotless[known])
+    unlit = among[seen[among] & ~lit[known[among]]]
+    apart = two_nearest(shown[unlit], shown[among])[0][:, 1]
+    missed = known[unlit[apart >= resolution]]
+
+    ray_states = np.zeros(len(plane), np.int64)
+    ray_states[known[outside & seen]] = -1
     ray_states[lit] = 1
     return ray_states, missed, stray
 

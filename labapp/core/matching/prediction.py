@@ -41,8 +41,8 @@ class RayPaths(ReadOnlyArrays):
 
     Parameters
     ----------
-    coefficients
-        Spline coefficients of the surface, shape (p,), mm.
+    basis, coefficients
+        The surface's splines, and their coefficients, shape (p,), mm.
     points_mm
         Reflection points, shape (R, 3), mm.
     slopes
@@ -51,6 +51,7 @@ class RayPaths(ReadOnlyArrays):
         Dots, IPCS, shape (R, 2), mm; NaN for rays that leave the splines or miss the plane.
     """
 
+    basis: SplineBasis
     coefficients: FloatArray
     points_mm: FloatArray
     slopes: FloatArray
@@ -73,7 +74,7 @@ class RayPaths(ReadOnlyArrays):
         points, slopes, dots = ray_kernels.intersect_and_reflect(
             basis.grid, coefficients, rays, start, steps, plane
         )
-        return cls(coefficients, points, slopes, dots)
+        return cls(basis, coefficients, points, slopes, dots)
 
 
 @dataclass(frozen=True)

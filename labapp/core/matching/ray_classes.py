@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.matching.observation import Observation, widened
+from labapp.core.matching.observation import UNLABELLED, Observation, widened
 from labapp.core.matching.prediction import RayPaths
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
@@ -17,7 +17,8 @@ dots are predicted in view by less than `OUT_OF_VIEW_SIGMA` σ. Its rays then ar
 dark."""
 
 NEAR_EDGE_MM = 8.0
-"""The uncertainty of predictions is computed only within this distance of the edge of the view."""
+"""Dots predicted within this distance of the edge of the view may be out of it. The uncertainty of
+predictions is computed only there."""
 
 
 @dataclass(frozen=True)
@@ -43,18 +44,22 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
     """Classify every ray, for labels of shape (rows, columns) and a surface fitted to them.
 
     Where the surface predicts that dots merge, neither a dot nor a ray counts as unexplained. This
-    includes the dots of rays next to labelled ones: a concave pool focuses its last rows.
+    includes the dots of rays next to labelled ones: a concave pool focuses its last rows. Nor does
+    a ray that the far side of such a pool may stop. Only labelled dots prove that dots are visible
+    outside the nominal plane: others may come from elsewhere.
     """
     from labapp.core.matching import match_kernels
 
+    view = observed.view_with(observed.plane_mm[labels[labels != UNLABELLED]])
     ray_states, missed, stray = match_kernels.classify_rays(
         labels,
         observed.without_dot,
+        (paths.basis.grid, paths.coefficients),
         (paths.points_mm, paths.slopes, paths.plane_mm),
         observed.rays.directions.reshape(-1, 3),
         observed.plane_mm,
-        observed.view,
-        np.array([observed.rig.electrode.height_mm, observed.resolution_mm]),
+        view,
+        np.array([observed.rig.electrode.height_mm, observed.resolution_mm, NEAR_EDGE_MM]),
     )
     return RayClasses(ray_states.reshape(labels.shape), missed, stray)
 
@@ -68,8 +73,7 @@ def certain_states(
     """Return the states of rays, with dark rays set to unknown if their dots may be out of view.
 
     Beyond the last visible row the fit extrapolates smoothly, whereas the pool gets steeper towards
-    its edge: the dots of the next row may lie farther out than predicted. And only labelled dots
-    prove that dots are visible outside the nominal plane: others may come from elsewhere.
+    its edge: the dots of the next row may lie farther out than predicted.
 
     Parameters
     ----------
@@ -81,11 +85,9 @@ def certain_states(
         Function of the flat indices of rays, shape (m,), that returns the covariance of their
         dots, shape (m, 2, 2), mm².
     """
-    lit, dark = ray_states > 0, np.flatnonzero(ray_states < 0)
+    lit, certain = ray_states > 0, ray_states.copy()
     labelled = paths.plane_mm[lit.ravel()]
     view = observed.view_with(labelled[np.isfinite(labelled[:, 0])])
-    certain = ray_states.copy()
-    certain.flat[dark[~observed.in_view(paths.plane_mm[dark], view=view)]] = 0
     rim = np.flatnonzero((certain < 0) & widened(lit, 1))
     near = rim[~observed.in_view(paths.plane_mm[rim], NEAR_EDGE_MM, view)]
     if _in_lines(near, ray_states.shape[1]).any():

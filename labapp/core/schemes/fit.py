@@ -12,6 +12,7 @@ from labapp.core.schemes import LEAST_DOTS
 from labapp.core.surface import measures
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.boundary_trace import retrace_boundary, trace_boundary
+from labapp.core.surface.level import BOUNDARY_UNSEEN, boundary_is_seen
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.setup_uncertainty import setup_changes, setup_sigma
@@ -134,14 +135,14 @@ def fit_surface(
     ------
     CannotMeasure
         ``too-few-dots`` for fewer than nine matched dots; ``no-surface`` if no surface fits the
-        dots; ``open-boundary`` if no dark ray constrains the boundary.
+        dots; ``open-boundary`` if no dark rays show the boundary.
     """
     if len(match.ray) < LEAST_DOTS:
         raise CannotMeasure(
             "too-few-dots", f"only {len(match.ray)} dots have a ray; a surface needs {LEAST_DOTS}"
         )
-    if not (match.ray_states < 0).any():
-        raise CannotMeasure("open-boundary", "no visible ray is missing: the boundary is not seen")
+    if not boundary_is_seen(match.ray_states):
+        raise CannotMeasure("open-boundary", BOUNDARY_UNSEEN)
     pool = fit_pool(match, rig, settings, initial, weigh_by_height_sigma=True)
     if pool.unsettled_mm > UNSETTLED_MM:
         raise CannotMeasure("no-surface", "the surface does not settle")

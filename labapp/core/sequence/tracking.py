@@ -29,7 +29,13 @@ from labapp.core.matching.ray_classes import RayClasses, certain_states, classif
 from labapp.core.schemes import LEAST_DOTS
 from labapp.core.schemes.fit import UNSETTLED_MM
 from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Prior, Tracked, predictions
-from labapp.core.surface.level import KnownRays, Level, LevelSearch
+from labapp.core.surface.level import (
+    BOUNDARY_UNSEEN,
+    KnownRays,
+    Level,
+    LevelSearch,
+    boundary_is_seen,
+)
 from labapp.core.surface.pool_fit import (
     FitSettings,
     fitted_pool,
@@ -396,8 +402,8 @@ def _with_level(
     observed, paths = fit.observed, fit.paths()
     found = classify_rays(observed, fit.labels, paths)
     ray_states = certain_states(observed, found.ray_states, paths, lambda some: covariance[some])
-    if not (ray_states < 0).any():
-        raise TrackLost("no visible ray is missing: the boundary is not seen")
+    if not boundary_is_seen(ray_states):
+        raise TrackLost(BOUNDARY_UNSEEN)
     missing = missing_share(len(found.missed), len(fit.lit_rays))
     known_rays = KnownRays.of(observed.rig, ray_states, prior.basis, missing)
     sigma = fit.rounds.height_sigma_mm(known_rays.landing_mm)

@@ -8,13 +8,14 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from labapp.core.compiled import FLOAT, FLOATS_1, FLOATS_2, FLOATS_3, INT
+from labapp.core.compiled import BOOLS_1, FLOAT, FLOATS_1, FLOATS_2, FLOATS_3, INT
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
 from labapp.core.surface.kernels.spline_kernels import height_and_slopes
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 _INTS_2 = types.Array(INT, 2, "A", readonly=True)
+_surface = types.Tuple((FLOATS_2, FLOATS_1))  # type: ignore[no-untyped-call]
 
 LONGEST_STEP_MM, LEAST_DESCENT = 0.5, 0.05
 """Longest Newton step along a ray, mm, and the least descent towards the surface that is assumed
@@ -25,6 +26,9 @@ LEAST_STEP_MM = 1e-12
 
 TIP_MARGIN_MM = 0.3
 """A ray that passes less than this below the electrode's tip may be hidden."""
+
+AGAIN_STEP_MM = 0.2
+"""Step along a reflected ray while it is searched for a place where it meets the surface again."""
 
 SNELL_STEPS = 4
 """Newton steps to the direction that leads through the glass to a dot: exact to rounding."""
@@ -284,6 +288,76 @@ def behind_torch(points: FloatArray, rays: FloatArray, slopes: FloatArray, tip: 
         # Both ways lead towards y = 0 and up.
         hidden[k] = points[k, 2] - points[k, 1] * z / y > tip - TIP_MARGIN_MM
     return hidden
+
+
+@_inner
+def _meet_again(
+    surface: tuple[FloatArray, FloatArray],
+    points: FloatArray,
+    rays: FloatArray,
+    slopes: FloatArray,
+    rim: float,
+) -> BoolArray:
+    """Whether reflected rays meet a surface again below a height, mm; a mask, shape (n,)."""
+    (grid, coefficients), work = surface, np.empty((4, 4))
+    met = np.zeros(len(rays), np.bool_)
+    for k in range(len(rays)):
+        a, b = slopes[k, 0], slopes[k, 1]
+        twice = 2.0 * (rays[k, 2] - a * rays[k, 0] - b * rays[k, 1]) / (a * a + b * b + 1.0)
+        x, y, z = rays[k, 0] + twice * a, rays[k, 1] + twice * b, rays[k, 2] - twice
+        step = AGAIN_STEP_MM / np.hypot(x, y)
+        at_x, at_y, at_z = points[k, 0], points[k, 1], points[k, 2]
+        while at_z < rim and not met[k]:
+            at_x, at_y, at_z = at_x + step * x, at_y + step * y, at_z + step * z
+            if not (grid[0, 0] <= at_x <= grid[0, 1] and grid[1, 0] <= at_y <= grid[1, 1]):
+                met[k] = z <= 0.0
+                break
+            met[k] = height_and_slopes(grid, coefficients, at_x, at_y, work)[0] > at_z
+    return met
+
+
+@_compiled(_surface, FLOATS_2, FLOATS_2, FLOATS_2, BOOLS_1, BOOLS_1)
+def stopped_by_far_side(
+    surface: tuple[FloatArray, FloatArray],
+    points: FloatArray,
+    rays: FloatArray,
+    slopes: FloatArray,
+    lit: BoolArray,
+    dark: BoolArray,
+) -> BoolArray:
+    """Whether the far side of a concave pool stops reflected rays, which then make no dot.
+
+    Rays that leave the near side at a small angle meet the far side, if it is high enough. Its rim
+    is taken to be half-way between the highest lit point and the lowest dark one whose ray nothing
+    would stop; if there is none, the rim may be as high as any dark point.
+
+    Parameters
+    ----------
+    surface, points, rays, slopes
+        Grid and coefficients of the surface; reflection points and directions of rays, shape
+        (n, 3), and slopes of the surface there, shape (n, 2).
+    lit, dark
+        Masks of the rays with a dot, and of those beside them that should have one in the picture
+        if the pool extended to them, shape (n,).
+
+    Returns
+    -------
+    BoolArray
+        A mask, shape (n,).
+    """
+    low, high = -np.inf, -np.inf
+    for k in range(len(points)):
+        low = max(low, points[k, 2]) if lit[k] else low
+        high = max(high, points[k, 2]) if dark[k] else high
+    if not high > low:  # of a convex pool
+        return np.zeros(len(points), np.bool_)
+    stopped, free = _meet_again(surface, points, rays, slopes, high), np.inf
+    for k in range(len(points)):
+        if dark[k] and not stopped[k]:
+            free = min(free, points[k, 2])
+    if free == np.inf:
+        return stopped
+    return _meet_again(surface, points, rays, slopes, max(low, (low + free) / 2.0))
 
 
 @_compiled(FLOATS_2, FLOATS_2, FLOATS_1)
