@@ -36,7 +36,7 @@ from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.line_pattern import KIND as LINES
 from labapp.core.geometry.line_pattern import LinePattern, LineRays, LineRig, line_rig
 from labapp.core.geometry.plausibility import implausible_values
-from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.rig import POSE, DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import (
     CALIBRATED,
     ENDINGS,
@@ -474,15 +474,9 @@ def _without_sigmas(keys: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _imaging_plane(keys: Mapping[str, Any]) -> ImagingPlane:
-    origin = np.array([-keys["s_mm"], -keys["distance_mm"], keys["h_mm"]], float)
-    pitch, yaw, roll = (keys.get(f"{turn}_deg", 0.0) for turn in ("pitch", "yaw", "roll"))
-    size = keys["width_mm"], keys["height_mm"]
-    plane = ImagingPlane.of_angles(origin, (pitch, yaw, roll), *size)
-    return replace(
-        plane,
-        glass_mm=keys.get("glass_mm", plane.glass_mm),
-        glass_index=keys.get("glass_index", plane.glass_index),
-    )
+    others = {name: value for name, value in _without_sigmas(keys).items() if name not in POSE}
+    plane = ImagingPlane(np.zeros(3), **others)
+    return plane.with_pose([keys.get(name, 0.0) for name in POSE])
 
 
 def _calibration(values: dict[str, Any]) -> ImageCalibration:

@@ -9,7 +9,7 @@ import pytest
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.geometry.folding import FoldingMirror, image_sigma, plane_of, pose_of
+from labapp.core.geometry.folding import FoldingMirror, image_sigma
 from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.core.pipeline import Settings, measure
 from labapp.core.schemes import fit
@@ -67,14 +67,14 @@ def test_pool_is_measured_via_a_mirror(
 
 def test_mirror_at_45_degrees_turns_a_level_plane_upright() -> None:
     image = MIRROR.image_of(LEVEL)
-    np.testing.assert_allclose(pose_of(image), [55, 50.8, 42, 0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(image.pose, [55, 50.8, 42, 0, 0, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (30.0, -20.0, 170.0), (-50.0, 120.0, -95.0)])
 def test_pose_has_the_angles_of_its_plane(angles: tuple[float, float, float]) -> None:
     plane = ImagingPlane.of_angles(np.array([-4.0, -30.0, 5.0]), angles)
-    np.testing.assert_allclose(pose_of(plane), [30, 4, 5, *angles], atol=1e-9)
-    again = plane_of(pose_of(MIRROR.image_of(MIRROR.image_of(plane))), plane)
+    np.testing.assert_allclose(plane.pose, [30, 4, 5, *angles], atol=1e-9)
+    again = plane.with_pose(MIRROR.image_of(MIRROR.image_of(plane)).pose)
     np.testing.assert_allclose(again.pose_mm, plane.pose_mm, atol=1e-9)
 
 

@@ -46,7 +46,8 @@ def calibrate_fold(
     import numpy as np
 
     from labapp.config.setup import read_setup, update_setup
-    from labapp.core.geometry.folding import FoldingMirror, image_sigma, pose_of
+    from labapp.core.geometry.folding import FoldingMirror, image_sigma
+    from labapp.core.geometry.rig import POSE
     from labapp.core.geometry.uncertainty import INDEX
 
     if not all(map(math.isfinite, point)):
@@ -56,7 +57,7 @@ def calibrate_fold(
     rig = warned(read_setup(setup)).rig
     assert rig.uncertainty is not None
     mirror = FoldingMirror(np.array(point), np.array(normal))
-    pose = pose_of(mirror.image_of(rig.imaging_plane))
+    pose = mirror.image_of(rig.imaging_plane).pose
     if abs(pose[3]) > STEEPEST_DEG:
         expected = f"an image that is not level: pitch below {STEEPEST_DEG:g} degrees"
         raise InputError("--normal", "image's pitch", f"{pose[3]:.4g} degrees", expected)
@@ -77,9 +78,6 @@ def calibrate_fold(
         update_setup(setup, {"imaging_plane": values | sigmas}, complete=True)
         typer.echo(f"They are the imaging plane of {setup.absolute()}")
 
-
-POSE = ("distance_mm", "s_mm", "h_mm", "pitch_deg", "yaw_deg", "roll_deg")
-"""Keys of the plane's pose, in the order of `folding.pose_of`."""
 
 STEEPEST_DEG = 85.0
 """Largest pitch: near 90 degrees, yaw and roll rotate about nearly the same axis."""

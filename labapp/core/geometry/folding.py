@@ -58,21 +58,6 @@ class FoldingMirror(ReadOnlyArrays):
         return FoldingMirror(self.point_mm + offset_mm * unit, normal)
 
 
-def pose_of(plane: ImagingPlane) -> FloatArray:
-    """Pose of a plane: distance, s, h (mm), pitch, yaw and roll (degrees), shape (6,)."""
-    x, y, z = plane.origin_mm
-    return np.array([-y, -x, z, *plane.angles_deg])
-
-
-def plane_of(pose: FloatArray, like: ImagingPlane) -> ImagingPlane:
-    """Plane with a pose (`pose_of`) and with the size and the glass of another plane."""
-    distance, s, h = pose[:3]
-    pitch, yaw, roll = pose[3:].tolist()
-    posed = ImagingPlane.of_angles(np.array([-s, -distance, h]), (pitch, yaw, roll))
-    axes = posed.x_axis, posed.z_axis
-    return replace(like, origin_mm=posed.origin_mm, x_axis=axes[0], z_axis=axes[1])
-
-
 def image_sigma(
     plane: ImagingPlane, mirror: FoldingMirror, sigma: FloatArray, mirror_sigma: FloatArray
 ) -> FloatArray:
@@ -85,21 +70,20 @@ def image_sigma(
     plane, mirror
         Imaging plane and mirror.
     sigma
-        Standard uncertainty of the plane's pose (`pose_of`), shape (6,).
+        Standard uncertainty of the plane's pose (`ImagingPlane.pose`), shape (6,).
     mirror_sigma
         Standard uncertainty of the mirror's position along its normal, mm, and of its tilt about
         both axes, degrees, shape (3,).
     """
-    pose = pose_of(plane)
-    image = pose_of(mirror.image_of(plane))
+    image = mirror.image_of(plane).pose
     columns = []
     for k, one in enumerate(sigma):
-        off = plane_of(pose + STEP * np.eye(6)[k], plane)
-        columns.append(one * _change(pose_of(mirror.image_of(off)), image))
+        off = plane.with_pose(plane.pose + STEP * np.eye(6)[k])
+        columns.append(one * _change(mirror.image_of(off).pose, image))
     for k, one in enumerate(mirror_sigma):
         offset, *tilt = (STEP * np.eye(3)[k]).tolist()
         moved = mirror.moved(offset, (tilt[0], tilt[1]))
-        columns.append(one * _change(pose_of(moved.image_of(plane)), image))
+        columns.append(one * _change(moved.image_of(plane).pose, image))
     return np.asarray(np.linalg.norm(columns, axis=0))
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration, with_ones
-from labapp.core.geometry.rig import ImagingPlane, Laser, Rig
+from labapp.core.geometry.rig import POSE, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import INDEX, POINTS, QUANTITIES, AxisPoints
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
@@ -90,13 +90,7 @@ def moved_plane(plane: ImagingPlane, offset: FloatArray) -> ImagingPlane:
     by = {name: offset[k] for name, k in _PLANE}
     if not any(by.values()):
         return plane
-    pitch, yaw, roll = plane.angles_deg
-    moved = ImagingPlane.of_angles(
-        plane.origin_mm + np.array([-by["s_mm"], -by["distance_mm"], by["h_mm"]]),
-        (pitch + by["pitch_deg"], yaw + by["yaw_deg"], roll + by["roll_deg"]),
-        plane.width_mm,
-        plane.height_mm,
-    )
+    moved = plane.with_pose(plane.pose + [by[name] for name in POSE])
     glass = plane.glass_mm + by["glass_mm"], plane.glass_index + by["glass_index"]
     return replace(moved, glass_mm=glass[0], glass_index=glass[1])
 
@@ -187,9 +181,7 @@ def quantity_values(rig: Rig) -> FloatArray:
     """Values of `QUANTITIES` of a rig with uncertainty, shape (q,), in their units."""
     assert rig.uncertainty is not None
     axes, plane = rig.uncertainty.axes, rig.imaging_plane
-    x_mm, y_mm, z_mm = plane.origin_mm.tolist()
-    at = {"distance_mm": -y_mm, "s_mm": -x_mm, "h_mm": z_mm}
-    at |= dict(zip(("pitch_deg", "yaw_deg", "roll_deg"), plane.angles_deg, strict=True))
+    at = dict(zip(POSE, plane.pose.tolist(), strict=True))
     at |= {"glass_mm": plane.glass_mm, "glass_index": plane.glass_index}
     values = np.zeros(len(INDEX))
     for part, names in ((rig.laser, _LASER), (rig.pattern, _PATTERN)):

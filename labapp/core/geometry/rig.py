@@ -6,11 +6,12 @@ electrode tip, Y along the weld, towards the laser, Z up, X to the right as the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from labapp.core.geometry.patterns import MEASURED, PATTERNS, MeasuredRay, measured_steps
 from labapp.core.geometry.uncertainty import RigUncertainty
@@ -178,6 +179,9 @@ class Electrode:
     height_mm: float = 5.0
 
 
+POSE = ("distance_mm", "s_mm", "h_mm", "pitch_deg", "yaw_deg", "roll_deg")
+"""Names of the quantities that determine the pose of the imaging plane (`ImagingPlane.pose`)."""
+
 _LEVEL = 1e-9
 """Largest horizontal component of the unit normal of a horizontal plane."""
 
@@ -251,6 +255,18 @@ class ImagingPlane(ReadOnlyArrays):
         if np.hypot(x, y) < _LEVEL:  # yaw and roll rotate a horizontal plane about the same axis
             yaw, roll = np.arctan2(self.x_axis[1], self.x_axis[0]), 0.0
         return float(np.degrees(pitch)), float(np.degrees(yaw)), float(np.degrees(roll))
+
+    @property
+    def pose(self) -> FloatArray:
+        """Quantities `POSE`: place of O′ (`vertical`), mm, and `angles_deg`, shape (6,)."""
+        x, y, z = self.origin_mm
+        return np.array([-y, -x, z, *self.angles_deg])
+
+    def with_pose(self, pose: npt.ArrayLike) -> ImagingPlane:
+        """Return a plane of the same size and glass with another `pose`, shape (6,)."""
+        distance, s, h, pitch, yaw, roll = np.asarray(pose, float).tolist()
+        posed = ImagingPlane.of_angles(np.array([-s, -distance, h]), (pitch, yaw, roll))
+        return replace(self, origin_mm=posed.origin_mm, x_axis=posed.x_axis, z_axis=posed.z_axis)
 
     @cached_property
     def normal(self) -> FloatArray:
