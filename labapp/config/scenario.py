@@ -6,7 +6,7 @@ It is a setup file with the additional tables [pool], [torch], [camera], [look] 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -252,7 +252,7 @@ def _pools(
         pool = Pool(_footprint(keys, head_sign), keys["height_mm"], terms, keys.get("fullness"))
         sizes = 1 + keys.get("wander_percent", 0) / 100 * _course(times_s, seed)
         return tuple(
-            _sized(pool, *size).after(time)
+            pool.scaled(*size).after(time)
             for size, time in zip(sizes.tolist(), times_s.tolist(), strict=True)
         )
     except ValueError as error:
@@ -280,15 +280,6 @@ def _terms(keys: dict[str, Any], head_sign: int) -> tuple[Term, ...]:
         waves.append(Wave(tuple(wave["mode"]), **given, travelling=travelling))
     rears = [LowRear(**rear, towards=-head_sign) for rear in _several(keys.get("low_rear"))]
     return (*dents, *rears, *waves)
-
-
-def _sized(pool: Pool, width: float, length: float, height: float) -> Pool:
-    """A pool with its sizes multiplied."""
-    foot = pool.footprint
-    foot = Footprint(
-        foot.width_mm * width, foot.head_mm * length, foot.tail_mm * length, foot.center_mm
-    )
-    return replace(pool, footprint=foot, peak_mm=pool.peak_mm * height)
 
 
 def _course(times_s: FloatArray, seed: int) -> FloatArray:

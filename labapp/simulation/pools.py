@@ -285,6 +285,16 @@ class Pool:
         if self.fullness is not None and not 0 <= self.fullness < 1:
             raise ValueError("fullness must be from 0 up to, but not including, 1")
 
+    def scaled(self, width: float, length: float, height: float) -> Pool:
+        """Return the pool with its sizes multiplied; disturbances are unchanged."""
+        foot = replace(
+            self.footprint,
+            width_mm=self.footprint.width_mm * width,
+            head_mm=self.footprint.head_mm * length,
+            tail_mm=self.footprint.tail_mm * length,
+        )
+        return replace(self, footprint=foot, peak_mm=self.peak_mm * height)
+
     @property
     def _kappa(self) -> float:
         if self.fullness is not None:

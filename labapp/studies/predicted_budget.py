@@ -82,16 +82,9 @@ def predicted_budget(rig: Rig, pool: Pool, progress: Progress | None = None) -> 
 def similar_pool(pool: Pool, rng: np.random.Generator) -> Pool:
     """Pool of the same shape with a random small shift and change of size."""
     scale = rng.uniform(1 - STRETCH, 1 + STRETCH)
-    foot = pool.footprint
-    x, y = np.array(foot.center_mm) + rng.uniform(-SHIFT_MM, SHIFT_MM, 2)
-    moved = replace(
-        foot,
-        width_mm=scale * foot.width_mm,
-        head_mm=scale * foot.head_mm,
-        tail_mm=scale * foot.tail_mm,
-        center_mm=(float(x), float(y)),
-    )
-    return replace(pool, footprint=moved, peak_mm=scale * pool.peak_mm)
+    x, y = np.array(pool.footprint.center_mm) + rng.uniform(-SHIFT_MM, SHIFT_MM, 2)
+    similar = pool.scaled(scale, scale, scale)
+    return replace(similar, footprint=replace(similar.footprint, center_mm=(float(x), float(y))))
 
 
 def _simulated(
