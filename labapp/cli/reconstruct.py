@@ -33,7 +33,6 @@ from labapp.cli.shared import (
     progress_bar,
     progress_sink,
     warned,
-    with_detector_and_rows,
 )
 from labapp.files import as_bytes, write_file
 
@@ -101,12 +100,12 @@ def reconstruct(
 
     A frame that cannot be measured has a row in measures.csv with its status.
     """
-    from labapp.config.settings import check_algorithm
+    from labapp.config.settings import check_algorithm, with_methods
     from labapp.core.pipeline import Settings
 
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
     check_algorithm(settings, "--algorithm")
-    settings = with_detector_and_rows(settings, detector, rows)
+    settings = with_methods(settings, detector, rows)
     places = {"lines": lines, "opcua": opcua}
     with ExitStack() as at_end:
         predictor = at_end.enter_context(_predicting(model, out)) if model is not None else None

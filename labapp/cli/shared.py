@@ -6,7 +6,6 @@ import math
 import os
 from collections.abc import Collection, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from labapp.config.setup import Setup
-    from labapp.core.pipeline import Settings
     from labapp.export.frame_result import FrameResult
     from labapp.export.summary import Summary
     from labapp.run.runner import Sink
@@ -195,18 +193,6 @@ def loaded_commands(module: str) -> type[Commands]:
             """Ignore the empty dictionary that a group is created with."""
 
     return LoadedCommands
-
-
-def with_detector_and_rows(
-    settings: Settings, detector: DetectorName | None, rows: RowsName | None
-) -> Settings:
-    """Return settings with another detector and row search; None: unchanged."""
-    dots, lattice = settings.dots, settings.lattice
-    return replace(
-        settings,
-        dots=replace(dots, method=detector or dots.method),
-        lattice=replace(lattice, method=rows or lattice.method),
-    )
 
 
 def progress_bar() -> Progress:

@@ -1,8 +1,8 @@
-"""Checks of the settings of a measurement that a user names."""
+"""Checks of the settings of a measurement that a user names, and choice of its methods."""
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -79,6 +79,19 @@ def check_algorithm(settings: Settings, source: str | Path, field: str = "algori
         if own:
             expected = f"one of {', '.join(own)}"
         raise InputError(source, field, settings.algorithm, expected)
+
+
+def with_methods(
+    settings: Settings, detector: str | None = None, rows: str | None = None
+) -> Settings:
+    """Return settings with another detector and search for rows; None: unchanged."""
+    dots: Any = {"method": detector or settings.dots.method}
+    lattice: Any = {"method": rows or settings.lattice.method}
+    return replace(
+        settings,
+        dots=replace(settings.dots, **dots),
+        lattice=replace(settings.lattice, **lattice),
+    )
 
 
 def _choices(owner: type, field: str) -> tuple[str, ...]:

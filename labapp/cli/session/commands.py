@@ -40,7 +40,6 @@ from labapp.cli.shared import (
     progress_shown,
     report_stale_results,
     warned,
-    with_detector_and_rows,
 )
 from labapp.core.schemes import scheme_words
 from labapp.errors import InputError, printable
@@ -281,10 +280,10 @@ def _set(
     rows: RowsName | None,
 ) -> None:
     """Store options as the session's settings, as one change of its history."""
-    from labapp.config.settings import check_algorithm
+    from labapp.config.settings import check_algorithm, with_methods
 
     settings: Settings = replace(session.settings, **options)  # type: ignore[arg-type]
-    settings = with_detector_and_rows(settings, detector, rows)
+    settings = with_methods(settings, detector, rows)
     if "algorithm" in options:
         check_algorithm(settings, "--algorithm")
     if settings != session.settings:

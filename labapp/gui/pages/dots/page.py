@@ -12,6 +12,7 @@ from typing import NamedTuple
 from PySide6.QtCore import QEvent, QObject, Qt
 from PySide6.QtGui import QAction, QKeyEvent, QKeySequence, QPixmap
 
+from labapp.config.settings import with_methods
 from labapp.core.pipeline import Settings
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.lattice import Site
@@ -107,10 +108,10 @@ class DotsPage(Page):
         for field in (panel.reference_row, panel.reference_column):
             field.edited.connect(lambda _: self._refer(panel.reference))
         panel.method.edited.connect(
-            lambda method: self._set(lambda now: presenter.with_method(now, method), "detector")
+            lambda method: self._set(lambda now: with_methods(now, method), "detector")
         )
         panel.row_search.edited.connect(
-            lambda method: self._set(lambda now: presenter.with_row_search(now, method), "rows")
+            lambda method: self._set(lambda now: with_methods(now, rows=method), "rows")
         )
         for number, field in zip(presenter.NUMBERS, panel.numbers, strict=True):
             field.edited.connect(partial(self._set_number, number))

@@ -450,13 +450,3 @@ def with_detector_value(
     """Copy of settings with another value of a detector's setting."""
     part: Any = replace(getattr(settings.dots, number.group), **{number.name: value})
     return replace(settings, dots=replace(settings.dots, **{number.group: part}))
-
-
-def with_method(settings: Settings, method: Any) -> Settings:
-    """Copy of settings with another detector."""
-    return replace(settings, dots=replace(settings.dots, method=method))
-
-
-def with_row_search(settings: Settings, method: Any) -> Settings:
-    """Copy of settings with another search for rows."""
-    return replace(settings, lattice=replace(settings.lattice, method=method))
