@@ -244,17 +244,13 @@ class Session(SessionContents):
             If the picture cannot be read.
         """
         from labapp.config.setup_text import lens_of
-        from labapp.core.calibration.plane_calibration import (
-            PlaneCalibrationSettings,
-            calibrate_plane,
-        )
+        from labapp.core.calibration.plane_calibration import calibrate_plane
         from labapp.media import read_picture
 
         require(picture, PATH, "calibrate_plane", "picture", "the path of a picture")
         check_positive(unit_mm, "calibrate_plane", "unit_mm", "mm")
         image = read_picture(picture)
-        settings = PlaneCalibrationSettings(unit_mm=unit_mm)
-        found = calibrate_plane(image, settings, lens_of(self.setup_text))
+        found = calibrate_plane(image, unit_mm, lens_of(self.setup_text))
         self.use_plane(found, unit_mm, image, Path(picture).name)
         return found
 

@@ -13,7 +13,7 @@ from labapp.core.calibration.board_calibration import BoardCalibration, calibrat
 from labapp.core.calibration.boards import BOARDS, BoardCorners, parse_board
 from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
 from labapp.core.calibration.lens_fit import fit_lens, fit_terms
-from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
+from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
 from labapp.simulation.calibration.target import Target, TargetLook, render_target
 from labapp.simulation.camera import Lens
@@ -234,11 +234,10 @@ def test_content_of_the_picture_is_recognised():
     target = Target()
     view = PosedView.at((40.0, 40.0), 5.5)
     picture = render_target(target, view, TargetLook(), rng)
-    settings = PlaneCalibrationSettings(unit_mm=target.unit_mm)
-    assert isinstance(calibrate_imaging_plane([picture], settings), PlaneCalibration)
+    assert isinstance(calibrate_imaging_plane([picture], target.unit_mm), PlaneCalibration)
     for board in (CHARUCO, CHESS, BOARDS["charuco_letter_a4"]):
         scale = 5.0 if board.square_mm == 8.0 else 2.6
-        calibration = calibrate_imaging_plane([shot(board, px_per_mm=scale)[1]], settings)
+        calibration = calibrate_imaging_plane([shot(board, px_per_mm=scale)[1]], target.unit_mm)
         assert isinstance(calibration, BoardCalibration)
         assert calibration.board == board
 
@@ -248,9 +247,8 @@ def test_known_lens_straightens_the_target():
     view = PosedView.at((36.0, 36.0), 6.2, turned_deg=(0, 0, 0.6), lens=lens(-1.0))
     picture = render_target(target, view, TargetLook(), rng)
     known = calibrated(CHARUCO)[1].image_calibration.lens
-    settings = PlaneCalibrationSettings(unit_mm=target.unit_mm)
-    with_lens = calibrate_imaging_plane([picture], settings, lens=known)
-    without = calibrate_imaging_plane([picture], settings)
+    with_lens = calibrate_imaging_plane([picture], target.unit_mm, lens=known)
+    without = calibrate_imaging_plane([picture], target.unit_mm)
     assert off_mm(with_lens, view).max() < 0.4 * off_mm(without, view).max()
 
 

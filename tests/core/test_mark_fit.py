@@ -10,7 +10,6 @@ import pytest
 from labapp.core.calibration.mark_fit import MarkFits, fit_marks, root_mean_square
 from labapp.core.calibration.plane_calibration import (
     PlaneCalibration,
-    PlaneCalibrationSettings,
     calibrate_plane,
 )
 from labapp.core.values import FloatArray
@@ -63,7 +62,7 @@ def calibrated(matrix: FloatArray, seed: int) -> PlaneCalibration:
     rows = tuple(tuple(row) for row in matrix.tolist())
     view = AskewView((0.0, 0.0), (1.0, 0.0), 1.0, (0.0, -1.0), 1.0, matrix=rows)
     image = render_target(Target(), view, TargetLook(), np.random.default_rng(seed))
-    return calibrate_plane(image, PlaneCalibrationSettings(unit_mm=6.35))
+    return calibrate_plane(image, unit_mm=6.35)
 
 
 def noisy(matrix: FloatArray, rng: np.random.Generator, sigma_px: float = 0.06) -> MarkFits:

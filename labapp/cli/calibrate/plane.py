@@ -90,7 +90,6 @@ def _calibrated(
     from labapp.config.toml_keys import read_text
     from labapp.core.calibration.boards import A_BOARD, parse_board
     from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
-    from labapp.core.calibration.plane_calibration import PlaneCalibrationSettings
     from labapp.core.values import CannotMeasure
     from labapp.media import read_picture
 
@@ -105,9 +104,8 @@ def _calibrated(
         text = read_text(setup, A_SETUP)
         check_lens(text, setup)
         lens = lens_of(text)
-    settings = PlaneCalibrationSettings(unit_mm=unit_mm)
     try:
-        return calibrate_imaging_plane(pictures, settings, named, lens), pictures[0].shape
+        return calibrate_imaging_plane(pictures, unit_mm, named, lens), pictures[0].shape
     except CannotMeasure as answer:
         if answer.status != "no-target":
             shown = "a picture in which the board is seen, flat and sharp"

@@ -6,11 +6,7 @@ from collections.abc import Sequence
 
 from labapp.core.calibration.board_calibration import BoardCalibration, calibrate_board
 from labapp.core.calibration.boards import Board, is_charuco
-from labapp.core.calibration.plane_calibration import (
-    PlaneCalibration,
-    PlaneCalibrationSettings,
-    calibrate_plane,
-)
+from labapp.core.calibration.plane_calibration import UNIT_MM, PlaneCalibration, calibrate_plane
 from labapp.core.calibration.target_marks import ColourOrGrey
 from labapp.core.geometry.coordinates import Lens
 from labapp.core.values import CannotMeasure
@@ -20,7 +16,7 @@ Calibration = PlaneCalibration | BoardCalibration
 
 def calibrate_imaging_plane(
     images: Sequence[ColourOrGrey],
-    settings: PlaneCalibrationSettings | None = None,
+    unit_mm: float = UNIT_MM,
     board: Board | None = None,
     lens: Lens | None = None,
 ) -> Calibration:
@@ -30,8 +26,8 @@ def calibrate_imaging_plane(
     ----------
     images
         Pictures; if there is more than one, they must show a board (`calibrate_board`).
-    settings
-        Settings for the target (`calibrate_plane`); None for the defaults.
+    unit_mm
+        Length of a unit of the target's axes, mm.
     board
         The board; needed if it is not one of labapp's, or if the pictures show several.
     lens
@@ -47,7 +43,7 @@ def calibrate_imaging_plane(
     if board is not None or len(images) != 1 or is_charuco(images[0]):
         return calibrate_board(images, board)
     try:
-        return calibrate_plane(images[0], settings, lens)
+        return calibrate_plane(images[0], unit_mm, lens)
     except CannotMeasure as why:
         try:
             return calibrate_board(images)

@@ -2,8 +2,8 @@
 
 The imaging plane shows a dot at O′ and a dark bar along each axis. The picture is levelled,
 thresholded, median filtered and dilated until three objects are left; these are thinned and
-distinguished by shape. The dissertation rounds their centres to whole pixels. By default each is
-then measured on the grey levels with sub-pixel accuracy, and every position is checked against the
+distinguished by shape. The dissertation rounds their centres to whole pixels. Here each is then
+measured on the grey levels with sub-pixel accuracy, and every position is checked against the
 design, because a wrong calibration is worse than none. The ends and unit flags of the bars give
 more than three marks: an affine map and a homography are fitted to them, and the better is used.
 """
@@ -38,6 +38,16 @@ from labapp.core.values import CannotMeasure, FloatArray
 
 AXES = ("O′X′", "O′Z′")
 
+X_UNITS, Z_UNITS = (1.0, 10.0), (1.0, 4.0)
+"""Where the bars on O′X′ and O′Z′ begin and end, units."""
+
+UNIT_MM = 6.35
+"""Usual length of a unit, mm."""
+
+SCALE_TOLERANCE, ANGLE_TOLERANCE_DEG = 0.2, 30.0
+"""Largest relative difference between the px/mm of the two axes, and largest deviation of the angle
+between them from 90°, degrees."""
+
 MOST_SIGMA_PX = 0.5
 """Largest accepted standard uncertainty of a point, px."""
 
@@ -53,35 +63,6 @@ FLAG_UNITS = 0.19
 
 MARK_OFF = 0.05
 """Largest distance of a mark from the position predicted by the others, with perspective, units."""
-
-
-@dataclass(frozen=True)
-class PlaneCalibrationSettings:
-    """Design of the target, and how it is found.
-
-    Parameters
-    ----------
-    unit_mm
-        Length of a unit of the axes, mm, "measured in advance" (§5.1.2).
-    x_units, z_units
-        Where the bars on O′X′ and O′Z′ begin and end, units.
-    threshold
-        Grey level below which a pixel is dark (T = 14 in the dissertation); None tries several.
-    subpixel
-        Measure on grey levels; False gives the whole pixels of Eq. 5-5.
-    scale_tolerance
-        Largest relative difference between the px/mm of the two axes.
-    angle_tolerance_deg
-        Largest deviation of the angle between the axes from 90°, degrees.
-    """
-
-    unit_mm: float = 6.35
-    x_units: tuple[float, float] = (1.0, 10.0)
-    z_units: tuple[float, float] = (1.0, 4.0)
-    threshold: float | None = None
-    subpixel: bool = True
-    scale_tolerance: float = 0.2
-    angle_tolerance_deg: float = 30.0
 
 
 @dataclass(frozen=True)
@@ -220,7 +201,7 @@ class PlaneCalibration(SeenAxes):
 
 
 def calibrate_plane(
-    image: ColourOrGrey, settings: PlaneCalibrationSettings | None = None, lens: Lens | None = None
+    image: ColourOrGrey, unit_mm: float = UNIT_MM, lens: Lens | None = None
 ) -> PlaneCalibration:
     """Find O′ and the axes in a picture of the imaging plane (§5.1.2).
 
@@ -228,8 +209,8 @@ def calibrate_plane(
     ----------
     image
         Grey or BGR(A) picture, shape (rows, columns[, channels]), of any integer or float type.
-    settings
-        The target's design and limits; None for the defaults.
+    unit_mm
+        Length of a unit of the target's axes, mm, "measured in advance" (§5.1.2).
     lens
         The camera's lens, if known.
 
@@ -241,14 +222,12 @@ def calibrate_plane(
         ``no-target`` if O′ and the two bars are not found as designed; the reason states what is
         missing or does not fit.
     """
-    settings = settings or PlaneCalibrationSettings()
-    grey = grey_levels(image)
-    background, darkness = levelled(grey)
+    background, darkness = levelled(grey_levels(image))
     failure = Refusal(-1, "The picture shows no dark marks on a light plane.")
-    for threshold, binary in segmented(grey, darkness, settings.threshold):
+    for threshold, binary in segmented(darkness):
         try:
             marks = three_marks(binary)
-            return _measured(marks, darkness, background, threshold, settings, lens)
+            return _measured(marks, darkness, background, threshold, unit_mm, lens)
         except Refusal as refusal:
             # The attempt that failed at the latest stage was closest: report its reason.
             if refusal.stage > failure.stage:
@@ -260,8 +239,8 @@ def _measured(
     marks: tuple[Mark, Mark, Mark],
     darkness: FloatArray,
     background: FloatArray,
-    level: float | None,
-    settings: PlaneCalibrationSettings,
+    level: float,
+    unit_mm: float,
     lens: Lens | None,
 ) -> PlaneCalibration:
     """Measure the three objects and check them against the design."""
@@ -275,41 +254,37 @@ def _measured(
             raise Refusal(
                 4, f"The {name} is blurred or partly covered: known to ±{uncertain:.1f} px only."
             )
-    if not settings.subpixel:
-        points = [np.floor(mark.center) for mark in marks]
-        sigma = [float(np.hypot(s, 1.0 / np.sqrt(12.0))) for s in sigma]
     row, column = np.round(origin[::-1]).astype(int)
-    bare = float(background[row, column])
     found = PlaneCalibration(
         origin_px=_pair(points[0]),
         x_axis_px=_pair(points[1]),
-        x_axis_mm=sum(settings.x_units) / 2.0 * settings.unit_mm,
+        x_axis_mm=sum(X_UNITS) / 2.0 * unit_mm,
         z_axis_px=_pair(points[2]),
-        z_axis_mm=sum(settings.z_units) / 2.0 * settings.unit_mm,
+        z_axis_mm=sum(Z_UNITS) / 2.0 * unit_mm,
         sigma_px=(sigma[0], sigma[1], sigma[2]),
-        threshold=bare * (1.0 - level) if level is not None else float(settings.threshold or 0.0),
+        threshold=float(background[row, column]) * (1.0 - level),
         lens=lens,
     )
     bars = (x_bar, z_bar)
-    for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):
+    for axis, bar, units in zip(AXES, bars, (X_UNITS, Z_UNITS), strict=True):
         _check_pointing(axis, origin, bar, units)
-    ticks = _tick_marks(origin, bars, darkness, settings)
+    ticks = _tick_marks(origin, bars, darkness, unit_mm)
     if not ticks:
         # Without flags, only the ends can show whether the bars are completely visible.
-        for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):
+        for axis, bar, units in zip(AXES, bars, (X_UNITS, Z_UNITS), strict=True):
             _check_length(axis, origin, bar, units)
-    if ticks and settings.subpixel:
+    if ticks:
         found = replace(found, marks=ticks)
         assert found.fits is not None
         found = replace(found, model=found.fits.best)
     along_x, along_z = found.px_per_mm
-    if abs(along_x / along_z - 1.0) > settings.scale_tolerance:
+    if abs(along_x / along_z - 1.0) > SCALE_TOLERANCE:
         raise Refusal(
             5,
             f"The axes' scales disagree: {along_x:.3g} px/mm along O′X′, {along_z:.3g} px/mm "
             "along O′Z′.",
         )
-    if abs(found.angle_deg - 90.0) > settings.angle_tolerance_deg:
+    if abs(found.angle_deg - 90.0) > ANGLE_TOLERANCE_DEG:
         raise Refusal(5, f"The axes are {found.angle_deg:.0f}° apart, which should be about 90°.")
     return found
 
@@ -318,13 +293,13 @@ def _tick_marks(
     origin: FloatArray,
     bars: tuple[Bar, Bar],
     darkness: FloatArray,
-    settings: PlaneCalibrationSettings,
+    unit_mm: float,
 ) -> tuple[tuple[float, float, float, float, float], ...]:
     """O′, the ends of the bars and their flags; empty if too few agree with the design."""
-    unit_px = float(np.hypot(*(bars[0].middle - origin))) / (sum(settings.x_units) / 2.0)
+    unit_px = float(np.hypot(*(bars[0].middle - origin))) / (sum(X_UNITS) / 2.0)
     places = [(0.0, 0.0, origin)]
     least = 1
-    for k, units in enumerate((settings.x_units, settings.z_units)):
+    for k, units in enumerate((X_UNITS, Z_UNITS)):
         bar, other = bars[k], bars[1 - k].direction
         along = bar_marks(bar, origin, units, other, FLAG_UNITS, darkness)
         places += [(t, 0.0, place) if k == 0 else (0.0, t, place) for t, place in along]
@@ -332,10 +307,10 @@ def _tick_marks(
     marks = [
         (x, z, *_pair(place), local_noise(darkness, place, 0.5 * unit_px)) for x, z, place in places
     ]
-    ends = {(t, 0.0) for t in settings.x_units} | {(0.0, t) for t in settings.z_units}
+    ends = {(t, 0.0) for t in X_UNITS} | {(0.0, t) for t in Z_UNITS}
     while len(marks) >= least:
         table = np.array(marks)
-        fit = fit_marks(table[:, :2] * settings.unit_mm, table[:, 2:4], table[:, 4]).homography
+        fit = fit_marks(table[:, :2] * unit_mm, table[:, 2:4], table[:, 4]).homography
         if fit is None:
             return ()
         off = np.hypot(*fit.left_out_px.T)
@@ -347,8 +322,7 @@ def _tick_marks(
             continue
         if off[worst] > MARK_OFF * unit_px:
             return ()
-        unit = settings.unit_mm
-        return tuple((x * unit, z * unit, u, v, noise) for x, z, u, v, noise in marks)
+        return tuple((x * unit_mm, z * unit_mm, u, v, noise) for x, z, u, v, noise in marks)
     return ()
 
 

@@ -111,32 +111,23 @@ def levelled(grey: FloatArray) -> tuple[FloatArray, FloatArray]:
     return background, 1.0 - grey / background
 
 
-def segmented(
-    grey: FloatArray, darkness: FloatArray, threshold: float | None
-) -> list[tuple[float | None, npt.NDArray[np.uint8]]]:
+def segmented(darkness: FloatArray) -> list[tuple[float, npt.NDArray[np.uint8]]]:
     """Return binary pictures to try, the dissertation's filter first (Eq. 5-1, 5-3).
 
     Parameters
     ----------
-    grey, darkness
-        Grey levels, and the missing fraction of the light, shape (rows, columns).
-    threshold
-        Grey level below which a pixel is dark; None tries several.
+    darkness
+        Missing fraction of the light, shape (rows, columns).
 
     Returns
     -------
     list
-        (threshold of the missing fraction, or None for the fixed threshold; picture of 0 and 1).
+        (threshold of the missing fraction; picture of 0 and 1).
     """
-    scale = max(grey.shape) / 640.0
+    scale = max(darkness.shape) / 640.0
     median = _odd(MEDIAN_PX * scale)
-    if threshold is not None:
-        # Eq. 5-1 on the grey levels.
-        pairs: list[tuple[float | None, BoolArray]] = [(None, grey < threshold)]
-    else:
-        smooth = np.asarray(cv2.GaussianBlur(darkness, (0, 0), max(scale, 0.5)), np.float64)
-        pairs = [(level, smooth > level) for level in _levels(smooth)]
-    binaries = [(level, binary.astype(np.uint8)) for level, binary in pairs]
+    smooth = np.asarray(cv2.GaussianBlur(darkness, (0, 0), max(scale, 0.5)), np.float64)
+    binaries = [(level, (smooth > level).astype(np.uint8)) for level in _levels(smooth)]
     # The dissertation's filter first; half its size for thin bars that it would remove.
     return [
         (level, _binary_median(binary, side))

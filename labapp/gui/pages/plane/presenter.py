@@ -12,7 +12,13 @@ from labapp.config.setup_text import image_calibration_of, lens_of
 from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.imaging_plane import Calibration, calibrate_imaging_plane
 from labapp.core.calibration.mark_fit import Model, root_mean_square
-from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
+from labapp.core.calibration.plane_calibration import (
+    ANGLE_TOLERANCE_DEG,
+    SCALE_TOLERANCE,
+    X_UNITS,
+    Z_UNITS,
+    PlaneCalibration,
+)
 from labapp.core.geometry.coordinates import Lens
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, round_factor
@@ -32,15 +38,12 @@ UNPLACED = float("inf")
 
 UNIT_MM = Target().unit_mm
 
-DESIGN = PlaneCalibrationSettings()
-
 Place = tuple[float, float]
 
 
 def find(images: Sequence[GreyImage], unit_mm: float, lens: Lens | None) -> Calibration:
     """Find O′ and the axes, or the corners of a board; raises `CannotMeasure` with the reason."""
-    settings = PlaneCalibrationSettings(unit_mm=unit_mm)
-    return calibrate_imaging_plane(images, settings, lens=lens)
+    return calibrate_imaging_plane(images, unit_mm, lens=lens)
 
 
 def first_points(shape: tuple[int, int], unit_mm: float) -> PlaneCalibration:
@@ -48,12 +51,12 @@ def first_points(shape: tuple[int, int], unit_mm: float) -> PlaneCalibration:
     rows, columns = shape
     side = 0.8 * min(rows, columns)
     u, v = 0.1 * columns, 0.9 * rows
-    x_arm, z_arm = (sum(units) / 2 for units in (DESIGN.x_units, DESIGN.z_units))
+    x_arm, z_arm = (sum(units) / 2 for units in (X_UNITS, Z_UNITS))
     return PlaneCalibration(
         origin_px=(u, v),
-        x_axis_px=(u + x_arm / DESIGN.x_units[1] * side, v),
+        x_axis_px=(u + x_arm / X_UNITS[1] * side, v),
         x_axis_mm=x_arm * unit_mm,
-        z_axis_px=(u, v - z_arm / DESIGN.x_units[1] * side),
+        z_axis_px=(u, v - z_arm / X_UNITS[1] * side),
         z_axis_mm=z_arm * unit_mm,
         sigma_px=(UNPLACED, UNPLACED, UNPLACED),
         threshold=0.0,
@@ -78,7 +81,7 @@ def with_unit(found: Calibration, unit_mm: float) -> Calibration:
     """The same points on a target of another unit; a board is unchanged."""
     if isinstance(found, BoardCalibration):
         return found
-    x_mm = sum(DESIGN.x_units) / 2 * unit_mm
+    x_mm = sum(X_UNITS) / 2 * unit_mm
     return found.with_scale(x_mm / found.x_axis_mm)
 
 
@@ -125,9 +128,9 @@ def result(found: Calibration | None) -> PlaneResult:
     ]
     (along_x, along_z), angle = found.px_per_mm, found.angle_deg
     warnings = []
-    if abs(along_x / along_z - 1) > DESIGN.scale_tolerance:
+    if abs(along_x / along_z - 1) > SCALE_TOLERANCE:
         warnings.append("The scales differ more than is plausible for a camera facing the plane")
-    if abs(angle - 90) > DESIGN.angle_tolerance_deg:
+    if abs(angle - 90) > ANGLE_TOLERANCE_DEG:
         warnings.append(f"The axes are {angle:.0f}° apart, which should be about 90°")
     return PlaneResult(tuple(rows), "", tuple(warnings))
 
@@ -307,7 +310,7 @@ def axes(found: Calibration, unit_mm: float) -> tuple[FloatArray, FloatArray]:
         ends = np.array([[found.x_axis_mm, 0.0], [0.0, 0.0], [0.0, found.z_axis_mm]])
         seen = found.image_calibration.to_image(found.board.corners_mm)
         return found.image_calibration.to_image(ends), seen
-    x_end, z_end = DESIGN.x_units[1], DESIGN.z_units[1]
+    x_end, z_end = X_UNITS[1], Z_UNITS[1]
     line = np.array([[x_end, 0.0], [0.0, 0.0], [0.0, z_end]]) * unit_mm
     marks = [(n, 0) for n in range(1, int(x_end) + 1)]
     marks += [(0, n) for n in range(1, int(z_end) + 1)]
