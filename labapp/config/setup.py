@@ -280,8 +280,9 @@ def unchecked_setup(text: str, path: str | os.PathLike[str]) -> str:
     if not values:
         return text
     del values["bench_check"]
-    bare = _without_section(text, path, "bench_check")
-    return updated_setup(bare, path, _keeping_sigmas(values, now))
+    document = _parsed(text, path)
+    document.pop("bench_check", None)
+    return updated_setup(tomlkit.dumps(document), path, _keeping_sigmas(values, now))
 
 
 def _keeping_sigmas(
@@ -297,12 +298,6 @@ def _keeping_sigmas(
         | dict(keys)
         for section, keys in values.items()
     }
-
-
-def _without_section(text: str, path: str | os.PathLike[str], section: str) -> str:
-    document = _parsed(text, path)
-    document.pop(section, None)
-    return tomlkit.dumps(document)
 
 
 def _parsed(text: str, path: str | os.PathLike[str]) -> tomlkit.TOMLDocument:

@@ -137,7 +137,6 @@ def trace(pool: PoolSurface, rig: Rig, torch: Torch | None = None) -> Reflection
 
 def exact_match(
     reflections: Reflections,
-    rig: Rig,
     orientation: Orientation | None = None,
     sigma_mm: float = 0.0,
     rng: np.random.Generator | None = None,

@@ -179,7 +179,7 @@ def laser_places(step: float) -> list[Laser]:
 def _errors(task: tuple[Pool, Rig, tuple[str, ...]]) -> FloatArray:
     cap, rig, schemes = task
     seen = trace_once(cap, rig)
-    match = exact_match(seen, rig)
+    match = exact_match(seen)
     return np.array([errors_of(match, seen, rig, cap, scheme) for scheme in schemes])
 
 

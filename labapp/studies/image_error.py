@@ -100,7 +100,7 @@ def axes_of(view: CameraView) -> AxisPoints:
 
 def exactly_seen(cap: Pool, rig: Rig) -> KnownPool:
     """A known pool with its dots at their true positions; those that miss the plane are lost."""
-    return KnownPool(cap, exact_match(trace_once(cap, rig), rig), rig, nominal(axes_of(VIEW)))
+    return KnownPool(cap, exact_match(trace_once(cap, rig)), rig, nominal(axes_of(VIEW)))
 
 
 def frame_errors(

@@ -93,7 +93,7 @@ def _simulated(
     rig, uncertainty, pool, number = task
     rng = np.random.default_rng([831, number])
     predicted = predict_error(pool, rig, dot_sigma_mm=DOT_SIGMA_MM, uncertainty=uncertainty)
-    match = exact_match(trace(pool, rig), rig, sigma_mm=DOT_SIGMA_MM, rng=rng)
+    match = exact_match(trace(pool, rig), sigma_mm=DOT_SIGMA_MM, rng=rng)
     changes = np.full(len(QUANTITIES), np.nan)
     try:
         made = reconstruct(match, rig, Settings())

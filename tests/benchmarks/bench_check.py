@@ -131,7 +131,7 @@ def measured(
     """Return a pool's height with a setup, and its ±, mm; NaN without a surface."""
     rng = np.random.default_rng(seed)
     image_px, ray = seen_dots(pool, bench, rng)
-    match = exact_match(trace(pool, bench.rig), rig)
+    match = exact_match(trace(pool, bench.rig))
     keep = (match.ray[:, None] == ray + 1).all(-1).any(1)
     covariance = np.tile((SIGMA_PX / PX_PER_MM) ** 2 * np.eye(2), (len(image_px), 1, 1))
     match = replace(

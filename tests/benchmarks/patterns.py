@@ -118,7 +118,7 @@ def density_line(name: str) -> str:
     rig, errors, rays = replace(OPEN_BENCH, pattern=PATTERNS[name]), [], []
     for cap in off_centre(caps_8_3_1(), 1):
         reflections = trace_once(cap, rig)
-        match = exact_match(reflections, rig)
+        match = exact_match(reflections)
         rays.append(len(match.ray))
         errors.append(errors_of(match, reflections, rig, cap, "fit")[0])
     lost = int(np.isnan(errors).sum())

@@ -468,7 +468,7 @@ def test_blind_spot_of_a_single_plate_is_reported():
     biased = check_bench([too_high], RIG, CALIBRATION)
     assert biased.status == "ok"
     pool = spherical_cap(6.7, 0.3)
-    match = exact_match(trace(pool, EXACT.rig), biased.rig)
+    match = exact_match(trace(pool, EXACT.rig))
     plane_mm = biased.calibration.to_plane(EXACT.view.to_image(match.plane_mm))
     match = replace(match, plane_mm=plane_mm)
     measures = measure_surface(fit.reconstruct(match, biased.rig, FitSettings()), match, biased.rig)

@@ -32,7 +32,7 @@ RIG = Rig(
 
 
 def match_of(pool):
-    return exact_match(trace(pool, RIG), RIG)
+    return exact_match(trace(pool, RIG))
 
 
 def edges_of(radius_at, rows, center=(0.0, 0.0)):

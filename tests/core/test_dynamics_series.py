@@ -167,7 +167,7 @@ def fitted_frames(pool, count, rate_hz, rng):
     still = None if pool.terms else trace(pool, OPEN_RIG)
     for k in range(count):
         traced = still or trace(pool.after(k / rate_hz), OPEN_RIG)
-        match = exact_match(traced, OPEN_RIG, None, 0.03, rng)
+        match = exact_match(traced, None, 0.03, rng)
         present, ray_states = rng.random(len(match.ray)) > 0.01, match.ray_states.copy()
         ray_states[tuple(match.ray[~present].T - 1)] = 0
         per_dot = ("ray", "dot", "reflected", "plane_mm", "plane_covariance_mm2")

@@ -31,7 +31,7 @@ CIRCLE = ers.ErsSettings(boundary="circle")
 
 
 def match_of(pool, rig=RIG, **noise):
-    return exact_match(trace(pool, rig), rig, **noise)
+    return exact_match(trace(pool, rig), **noise)
 
 
 def without(match, removed):
@@ -71,7 +71,7 @@ def test_denser_pattern_halves_the_error():
         each = []
         for cap in caps:
             # As in the dissertation, a second reflection in a deep hollow is ignored.
-            match = exact_match(trace_once(cap, rig), rig)
+            match = exact_match(trace_once(cap, rig))
             measures = measure_surface(ers.reconstruct(match, rig, CIRCLE), match, rig)
             depth = measures.height_mm if cap.peak_mm > 0 else -measures.depth_mm
             each.append(abs(depth / abs(cap.peak_mm) - 1))

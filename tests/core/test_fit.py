@@ -39,7 +39,7 @@ NOISE_MM = 0.053
 def fitted(
     pool: Pool, sigma_mm: float = 0.0, rng: np.random.Generator | None = None
 ) -> tuple[Reconstruction, Match]:
-    match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG, sigma_mm=sigma_mm, rng=rng)
+    match = exact_match(trace(pool, OPEN_RIG), sigma_mm=sigma_mm, rng=rng)
     return fit.reconstruct(match, OPEN_RIG, FitSettings()), match
 
 
@@ -66,7 +66,7 @@ def test_pool_is_measured_where_head_and_rear_miss_the_plane(
     # Even with a dense pattern only the middle third of the pool is visible.
     rig = replace(BENCH, pattern=DotPattern(37, 37, 0.385))
     pool = spherical_cap(width_mm, depth_mm)
-    match = exact_match(trace(pool, rig), rig)
+    match = exact_match(trace(pool, rig))
     reconstruction = fit.reconstruct(match, rig, FitSettings())
     sizes = measure_surface(reconstruction, match, rig)
     assert np.ptp(reconstruction.points_mm[:, 1]) < 0.75 * width_mm
@@ -144,7 +144,7 @@ def test_size_uncertainty_is_the_spread_over_the_posterior(seen: Pool) -> None:
     # Surfaces drawn from the covariance of the fit, each measured.
     rng = np.random.default_rng(0)
     reflections = trace(seen, OPEN_RIG)
-    match = exact_match(reflections, OPEN_RIG, sigma_mm=NOISE_MM, rng=rng)
+    match = exact_match(reflections, sigma_mm=NOISE_MM, rng=rng)
     reconstruction = fit.reconstruct(match, OPEN_RIG, FitSettings())
     pool = fit_pool(match, OPEN_RIG, FitSettings())
     level, sizes = pool.level, []
@@ -168,7 +168,7 @@ def test_size_uncertainty_is_the_spread_over_the_posterior(seen: Pool) -> None:
 def test_wetting_slope_of_a_cap_is_that_at_its_boundary() -> None:
     """One per cent inside, it would be smaller by one per cent, which is 2.5 σ here."""
     pool = spherical_cap(5.6, 0.25)
-    match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG)
+    match = exact_match(trace(pool, OPEN_RIG))
     surface = fit.fit_surface(match, OPEN_RIG, FitSettings())
     found = fit.bound_and_measure(match, surface, OPEN_RIG, FitSettings())[1]
     # A sphere's cap of height h over a circle of radius a ends at the angle 2 atan(h/a).
@@ -259,7 +259,7 @@ def test_sizes_have_uncertainties_where_last_rows_are_hidden() -> None:
     # which would be outside if it were one σ farther out.
     rng = np.random.default_rng(1)
     pool = egg(7.16, 3.78, 4.62, 0.131)
-    match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG, sigma_mm=0.12, rng=rng)
+    match = exact_match(trace(pool, OPEN_RIG), sigma_mm=0.12, rng=rng)
     hidden = match.ray[:, 0] < match.ray[:, 0].min() + 2
     ray_states = match.ray_states.copy()
     ray_states[tuple(match.ray[hidden].T - 1)] = 0
@@ -323,7 +323,7 @@ def test_setup_part_of_a_frame_is_the_kept_one_or_the_mean_with_its_own(
 ) -> None:
     """With an exact set-up the frame's own is 0."""
     pool = spherical_cap(5.6, 0.25)
-    match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG)
+    match = exact_match(trace(pool, OPEN_RIG))
     surface = fit.fit_surface(match, OPEN_RIG, FitSettings())
     made, sizes = fit.bound_and_measure(match, surface, OPEN_RIG, FitSettings())
     part = fit.SetupPart(np.full(9, 3.0), sizes.sizes, used=used)

@@ -55,7 +55,7 @@ def test_pool_is_measured_via_a_mirror(
     middle = turned.to_universal(np.array([50.8, 50.8]))
     paper = mirror.image_of(replace(turned, origin_mm=np.array([0.0, -50.0, 50.8]) - middle))
     rig = replace(BENCH, imaging_plane=mirror.image_of(paper))
-    match = exact_match(trace(POOL, rig), rig)
+    match = exact_match(trace(POOL, rig))
     true = folded_paths(rig, paper, mirror)[tuple(match.ray.T - 1)]
     assert len(match.ray) > 60
     np.testing.assert_allclose(match.plane_mm, true, atol=1e-9)

@@ -97,7 +97,7 @@ def test_pool_is_measured_through_glass_as_without(scheme):
     settings = Settings(scheme=scheme)
 
     def height(true: Rig, believed: Rig) -> float:
-        match = exact_match(trace(POOL, true), true)
+        match = exact_match(trace(POOL, true))
         return measure_surface(reconstruct(match, believed, settings), match, believed).height_mm
 
     bare = replace(RIG, imaging_plane=UPRIGHT)

@@ -20,7 +20,7 @@ POOLS = [spherical_cap(6.0, 0.3, (0.1, 0.05)), egg(6.4, 2.9, 3.8, 0.3, (0.0, -0.
 
 
 def match_of(pool):
-    return exact_match(trace(pool, OPEN_BENCH), OPEN_BENCH)
+    return exact_match(trace(pool, OPEN_BENCH))
 
 
 def test_zonal_heights_of_a_quadric_are_exact():

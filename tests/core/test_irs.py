@@ -28,7 +28,7 @@ ALGORITHMS = ("opa", "epa-r", "epa-c", "epa-rc")
 
 
 def match_of(pool, **noise):
-    return exact_match(trace(pool, RIG), RIG, **noise)
+    return exact_match(trace(pool, RIG), **noise)
 
 
 def without(match, removed):

@@ -34,7 +34,7 @@ RIG = Rig(
 
 def truth(pool: Pool, residual=None):
     """Return the reconstruction by a perfect scheme, and its match."""
-    match = exact_match(trace(pool, RIG), RIG)
+    match = exact_match(trace(pool, RIG))
     count = len(match.ray)
     points = trace(pool, RIG).point_mm[match.ray[:, 0] - 1, match.ray[:, 1] - 1]
     rim = pool.boundary_mm()
@@ -180,7 +180,7 @@ def test_mesh_ends_at_the_boundary_and_faces_up():
     ("scheme", "settings"), [(irs, irs.IrsSettings()), (ers, ers.ErsSettings())], ids=["irs", "ers"]
 )
 def test_residuals_of_irs_and_ers_are_those_of_their_surfaces(scheme, settings):
-    match = exact_match(trace(egg(6.6, 3.0, 4.0, 0.2), RIG), RIG)
+    match = exact_match(trace(egg(6.6, 3.0, 4.0, 0.2), RIG))
     reconstruction = scheme.reconstruct(match, RIG, settings)
     measures = measure_surface(reconstruction, match, RIG)
     # Independent of the program: search along each ray in vertical steps of 1 µm.

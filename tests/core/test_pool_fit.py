@@ -72,7 +72,7 @@ def fitted(match: Match, **changes: object) -> FittedPool:
 
 @pytest.fixture(scope="module")
 def match() -> Match:
-    return exact_match(trace(POOL, OPEN_RIG), OPEN_RIG)
+    return exact_match(trace(POOL, OPEN_RIG))
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -193,7 +193,7 @@ def test_surface_is_independent_of_the_plane_pose(
     match: Match, roll_deg: float, lean_deg: float
 ) -> None:
     rig = replace(OPEN_RIG, imaging_plane=tilted_plane(roll_deg, lean_deg))
-    tilted = exact_match(trace(POOL, rig), rig)
+    tilted = exact_match(trace(POOL, rig))
     np.testing.assert_array_equal(tilted.ray, match.ray)
     upright = fit.reconstruct(match, OPEN_RIG, FitSettings())
     from_tilted = fit.reconstruct(tilted, rig, FitSettings())
@@ -261,7 +261,7 @@ def test_corner_of_the_pool_is_rejected(match: Match) -> None:
 def test_garbage_gives_a_surface_or_a_reason(seed: int, noise_mm: float) -> None:
     rng = np.random.default_rng(seed)
     pool: Pool = spherical_cap(6.0, float(rng.choice([0.4, -0.5])))
-    good = exact_match(trace(pool, OPEN_RIG), OPEN_RIG)
+    good = exact_match(trace(pool, OPEN_RIG))
     garbage = replace(
         good,
         plane_mm=good.plane_mm + rng.normal(0.0, noise_mm, good.plane_mm.shape),
@@ -312,7 +312,7 @@ def test_rear_sinks_although_no_dark_ray_is_seen_there() -> None:
     """The lit rays at the rear land outside the boundary that the head determines."""
     for drop_mm in 0.0, 0.1:
         pool = egg(6.6, 3.0, 3.9, 0.33, terms=(LowRear(drop_mm),))
-        match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG)
+        match = exact_match(trace(pool, OPEN_RIG))
         ray_states = match.ray_states.copy()
         ray_states[(ray_states < 0) & (np.arange(1, 20)[:, None] < match.ray[:, 0].min() + 2)] = 0
         match = replace(match, ray_states=ray_states)
@@ -356,7 +356,7 @@ def test_lengths_of_pools_with_a_low_rear_are_within_twice_their_uncertainty(tra
             back = Footprint(footprint.width_mm, footprint.tail_mm, footprint.head_mm, (x, -y))
             low = replace(low, towards=1)
             pool, rig = replace(pool, footprint=back, terms=(low,)), replace(rig, travel="-y")
-        match = exact_match(trace(pool, rig), rig)
+        match = exact_match(trace(pool, rig))
         fitted = fit.fit_surface(match, rig, FitSettings())
         size = fit.bound_and_measure(match, fitted, rig, FitSettings())[1]
         deviations.append((size.length_mm - pool.size.length_mm) / size.length_sigma_mm)
@@ -399,7 +399,7 @@ def test_uncertainty_of_shift_and_drop_agrees_with_samples() -> None:
 
 def test_laser_ten_times_too_far_away_is_rejected() -> None:
     """The splines would take gigabytes."""
-    match = exact_match(trace(POOL, OPEN_RIG), OPEN_RIG)
+    match = exact_match(trace(POOL, OPEN_RIG))
     far = replace(OPEN_RIG.laser, distance_mm=10 * OPEN_RIG.laser.distance_mm)
     with pytest.raises(CannotMeasure) as caught:
         fit_pool(match, replace(OPEN_RIG, laser=far), FitSettings())

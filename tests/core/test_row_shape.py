@@ -38,7 +38,7 @@ def test_row_shapes_allow_the_orientations_of_tables_4_4_and_4_5(sign: int) -> N
 def test_row_shape_of_a_noisy_match(width_mm: float, height_mm: float) -> None:
     rng = np.random.default_rng(3)
     reflections = trace(spherical_cap(width_mm, height_mm), OPEN_BENCH)
-    match = exact_match(reflections, OPEN_BENCH, sigma_mm=0.03, rng=rng)
+    match = exact_match(reflections, sigma_mm=0.03, rng=rng)
     shapes = match_row_shapes(match)
     assert shapes.allows(match.orientation)
     assert shapes.shape == ("concave" if height_mm == -0.03 else "convex")

@@ -28,7 +28,7 @@ def frames(count: int, seed: int = 0) -> list[Measurement]:
     for k in range(count):
         width = 6.0 * rng.normal(1.0, 0.01)
         pool = egg(width, 2.9, 3.7, 0.3, (0.1, -0.2), (replace(wave, time_s=k / 200),))
-        match = exact_match(trace(pool, BENCH_RIG), BENCH_RIG, sigma_mm=0.02, rng=rng)
+        match = exact_match(trace(pool, BENCH_RIG), sigma_mm=0.02, rng=rng)
         surface = fit.reconstruct(match, BENCH_RIG, SETTINGS.fit)
         measurements.append(Measurement("ok", "", "fit", match=match, reconstruction=surface))
     return measurements

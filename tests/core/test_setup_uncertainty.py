@@ -31,7 +31,7 @@ SIZED = [0, 1, 2, 4, 5]
 
 SETUP = read_setup(Path(__file__).parents[2] / "sample_sessions" / "gtaw" / "setup.toml")
 RIG, SETTINGS = SETUP.rig, FitSettings()
-MATCH = exact_match(trace(egg(6.6, 3.0, 3.9, 0.33), RIG), RIG)
+MATCH = exact_match(trace(egg(6.6, 3.0, 3.9, 0.33), RIG))
 
 
 def changes(pool: FittedPool | None = None, match: Match = MATCH) -> FloatArray:
@@ -72,7 +72,7 @@ def test_changes_agree_with_fits_on_perturbed_benches(key: str) -> None:
 @pytest.mark.parametrize("key", ["laser.projection_angle_deg", "imaging_plane.h_mm"])
 def test_changes_include_a_rear_that_seems_lower(key: str) -> None:
     """On one of the perturbed benches the rear seems to lie 0.1 mm below the work piece."""
-    assert_changes_agree(key, exact_match(trace(egg(7.0, 3.3, 4.0, 0.35), RIG), RIG))
+    assert_changes_agree(key, exact_match(trace(egg(7.0, 3.3, 4.0, 0.35), RIG)))
 
 
 def assert_changes_agree(key: str, match: Match) -> None:
@@ -152,7 +152,7 @@ def test_height_is_covered_with_a_plane_from_a_noisy_picture() -> None:
     def height(text: str) -> FloatArray:
         """Return the height with a setup, and the setup's part of its ±."""
         setup = parse_setup(text, "setup.toml")
-        match = exact_match(trace(pool, setup.rig), setup.rig)
+        match = exact_match(trace(pool, setup.rig))
         match = replace(match, plane_mm=setup.calibration.to_plane(seen_px))
         reconstruction = fit.reconstruct(match, setup.rig, SETTINGS)
         size = measure_surface(reconstruction, match, setup.rig)

@@ -136,7 +136,7 @@ def test_are_agrees_with_the_points(out: Path, writer: Writer, scheme: str) -> N
     )
     rng = np.random.default_rng(5)
     reflections = trace(egg(6.6, 3.0, 4.0, 0.35), rig)
-    match = exact_match(reflections, rig, sigma_mm=0.05, rng=rng)
+    match = exact_match(reflections, sigma_mm=0.05, rng=rng)
     match = replace(match, dot=np.zeros(len(match.ray), int))
     reconstruction = reconstruct(match, rig, Settings(scheme=scheme))
     size = measure_surface(reconstruction, match, rig)
@@ -158,7 +158,7 @@ def test_are_agrees_with_the_points(out: Path, writer: Writer, scheme: str) -> N
     assert {np.sign(value) for value in column["error_y_mm"]} >= {-1.0, 1.0}
     assert bool(measures["own_are_mm"]) == (scheme != "fit")
     if scheme == "fit":  # captured minus computed: the noise added to a dot
-        noise = match.plane_mm - exact_match(reflections, rig).plane_mm
+        noise = match.plane_mm - exact_match(reflections).plane_mm
         assert np.corrcoef(column["residual_x_mm"], noise[:, 0])[0, 1] > 0.5
         assert np.corrcoef(column["residual_z_mm"], noise[:, 1])[0, 1] > 0.5
 

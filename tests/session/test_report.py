@@ -55,7 +55,7 @@ def setup() -> Setup:
 @pytest.fixture(scope="module")
 def cap_measurement(setup: Setup) -> Measurement:
     """A cap of 6 mm, 0.3 mm high, measured by ERS from exact dots."""
-    match = exact_match(trace(spherical_cap(6.0, 0.3), setup.rig), setup.rig)
+    match = exact_match(trace(spherical_cap(6.0, 0.3), setup.rig))
     reconstruction = ers.reconstruct(match, setup.rig, ers.ErsSettings())
     return Measurement(
         status="ok",

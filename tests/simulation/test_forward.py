@@ -105,7 +105,7 @@ def test_absent_rays_are_never_visible_and_in_an_unknown_state():
     assert np.argwhere(reflections.absent).tolist() == [[9, 9], [11, 6]]
     assert reflections.hit[reflections.absent].all()
     assert not reflections.visible[reflections.absent].any()
-    match = exact_match(reflections, rig)
+    match = exact_match(reflections)
     assert (match.ray_states[reflections.absent] == 0).all()
 
 
@@ -253,7 +253,7 @@ def test_first_of_several_intersections_counts():
 @pytest.mark.parametrize("orientation", ["S/S", "S/I", "I/I"])
 def test_exact_match_numbers_dots_by_the_conventions(orientation):
     rig = rig_with()
-    match = exact_match(trace(spherical_cap(6, 0.3), rig), rig, orientation)
+    match = exact_match(trace(spherical_cap(6, 0.3), rig), orientation)
     i, j = match.ray.T
     k, t = match.reflected.T
     assert match.orientation == orientation
@@ -267,14 +267,14 @@ def test_exact_match_numbers_dots_by_the_conventions(orientation):
 def test_exact_match_has_the_orientation_of_the_28_caps():
     rig = rig_with()
     for pool in caps_8_3_1():
-        match = exact_match(trace(pool, rig), rig)
+        match = exact_match(trace(pool, rig))
         assert match.orientation == ("S/S" if pool.peak_mm > 0 else "I/I")
 
 
 def test_states_of_lit_dark_and_unknown_rays():
     rig = rig_with(electrode=5.0)
     reflections = trace(spherical_cap(8, 0.8), rig)
-    match = exact_match(reflections, rig)
+    match = exact_match(reflections)
     assert {-1, 0, 1} == set(match.ray_states.flat)
     lit, dark, unknown = (match.ray_states == value for value in (1, -1, 0))
     np.testing.assert_array_equal(np.argwhere(lit) + 1, match.ray)
@@ -287,22 +287,19 @@ def test_states_of_lit_dark_and_unknown_rays():
 def test_exact_match_noise_has_the_covariance_it_claims():
     rig = rig_with()
     reflections = trace(spherical_cap(8, 0.4), rig)
-    clean = exact_match(reflections, rig)
+    clean = exact_match(reflections)
     rng = np.random.default_rng(3)
     errors = np.concatenate(
-        [
-            exact_match(reflections, rig, None, 0.05, rng).plane_mm - clean.plane_mm
-            for _ in range(20)
-        ]
+        [exact_match(reflections, None, 0.05, rng).plane_mm - clean.plane_mm for _ in range(20)]
     )
-    match = exact_match(reflections, rig, None, 0.05, rng)
+    match = exact_match(reflections, None, 0.05, rng)
     np.testing.assert_allclose(
         match.plane_covariance_mm2,
         0.0025 * np.ones((1, 1, 1)) * np.eye(2) + np.zeros((len(match.ray), 1, 1)),
     )
     np.testing.assert_allclose(np.cov(errors.T), 0.0025 * np.eye(2), atol=1.5e-4)
     with pytest.raises(ValueError, match="generator"):
-        exact_match(reflections, rig, sigma_mm=0.05)
+        exact_match(reflections, sigma_mm=0.05)
 
 
 def test_even_pattern_has_rays_on_both_sides_of_its_axis():
@@ -318,7 +315,7 @@ def test_rays_that_miss_the_pool_make_no_dots():
     rig = rig_with()
     reflections = trace(replace(spherical_cap(2, 0.1), footprint=Foot(2, 1, 1, (50, 50))), rig)
     assert not reflections.hit.any()
-    match = exact_match(reflections, rig)
+    match = exact_match(reflections)
     assert match.ray.shape == (0, 2)
     assert match.plane_mm.shape == (0, 2)
 

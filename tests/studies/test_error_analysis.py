@@ -174,7 +174,7 @@ def test_predicted_error_agrees_with_the_fit(sign: int) -> None:
             sign * width * rng.uniform(0.04, 0.07),
             (rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3)),
         )
-        match = exact_match(trace(pool, BENCH), BENCH, sigma_mm=DOT_SIGMA_MM, rng=rng)
+        match = exact_match(trace(pool, BENCH), sigma_mm=DOT_SIGMA_MM, rng=rng)
         size = measure_surface(fit.reconstruct(match, BENCH, FitSettings()), match, BENCH)
         measured = size.height_mm if sign > 0 else -size.depth_mm
         errors.append(measured - abs(pool.peak_mm))
@@ -214,7 +214,7 @@ def test_predicted_setup_part_agrees_with_the_fit() -> None:
     pool = spherical_cap(6.0, 0.3)
     known = RigUncertainty(axes_of(VIEW), *covariance_of({}, 0.9))
     rig = replace(BENCH, uncertainty=known)
-    match = exact_match(trace(pool, BENCH), BENCH, sigma_mm=0.02, rng=np.random.default_rng(2))
+    match = exact_match(trace(pool, BENCH), sigma_mm=0.02, rng=np.random.default_rng(2))
     reconstruction = fit.reconstruct(match, rig, FitSettings())
     predicted = predict_error(pool, BENCH, uncertainty=known)
     assert predicted.setup_mm == pytest.approx(reconstruction.size_sigma_setup[2], rel=0.25)

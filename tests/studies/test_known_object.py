@@ -18,7 +18,7 @@ def named_rows(table) -> dict[str, dict[str, object]]:
 
 
 def test_errors_are_relative_to_the_entered_size() -> None:
-    match = exact_match(trace(TACK, TACK_RIG), TACK_RIG)
+    match = exact_match(trace(TACK, TACK_RIG))
     right = named_rows(known_object_table(match, TACK_RIG, known_cap(9.75, 0.91)))
     assert set(right) == set(SCHEMES) >= {"fit", "ers", "irs", "zonal", "modal"}
     assert right["fit"]["height_error_pct"] < 1

@@ -58,9 +58,6 @@ MIDDLE_OFF = 0.1
 """Largest distance of a bar's middle from the position expected from its length and O′, units. This
 detects a partly hidden bar: its middle moves by half of the hidden length."""
 
-FLAG_UNITS = 0.19
-"""Length by which the unit flags protrude from their bars, units."""
-
 MARK_OFF = 0.05
 """Largest distance of a mark from the position predicted by the others, with perspective, units."""
 
@@ -301,7 +298,7 @@ def _tick_marks(
     least = 1
     for k, units in enumerate((X_UNITS, Z_UNITS)):
         bar, other = bars[k], bars[1 - k].direction
-        along = bar_marks(bar, origin, units, other, FLAG_UNITS, darkness)
+        along = bar_marks(bar, origin, units, other, darkness)
         places += [(t, 0.0, place) if k == 0 else (0.0, t, place) for t, place in along]
         least += 2 + (int(np.ceil(units[1])) - int(np.floor(units[0])) - 1) // 2
     marks = [

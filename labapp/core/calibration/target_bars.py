@@ -18,6 +18,9 @@ from labapp.core.values import FloatArray, ReadOnlyArrays, robust_sigma
 END_PX = 4.0
 """Largest distance of a bar's end from its first estimate, px."""
 
+FLAG_UNITS = 0.19
+"""Length by which a flag protrudes on at least one side of its bar, units."""
+
 
 @dataclass(frozen=True)
 class Bar(ReadOnlyArrays):
@@ -171,7 +174,6 @@ def bar_marks(
     origin: FloatArray,
     units: tuple[float, float],
     flags_along: FloatArray,
-    flag_units: float,
     darkness: FloatArray,
 ) -> list[tuple[float, FloatArray]]:
     """Return both ends of a bar and its visible unit flags.
@@ -184,8 +186,6 @@ def bar_marks(
         Begin and end of the bar, units.
     flags_along
         Direction of the flags in the picture: that of the other axis.
-    flag_units
-        Length by which a flag protrudes on at least one side of the bar, units.
     darkness
         Missing fraction of the light, shape (rows, columns).
 
@@ -208,7 +208,7 @@ def bar_marks(
     found = [(begin, 0.0), (end, 2.0 * bar.half_length)]
     for n in range(int(np.floor(begin)) + 1, int(np.ceil(end))):
         guess = a * n / (1.0 + k * n) - near
-        at = _flag(bar, start + guess * bar.direction, unit_px, flags_along, flag_units, darkness)
+        at = _flag(bar, start + guess * bar.direction, unit_px, flags_along, darkness)
         if at is not None:
             found.append((float(n), guess + at))
     place, deviation = bar.midline.T
@@ -227,7 +227,6 @@ def _flag(
     guess: FloatArray,
     unit_px: float,
     flags_along: FloatArray,
-    flag_units: float,
     darkness: FloatArray,
 ) -> float | None:
     """Displacement of a flag along the bar from an initial guess, px; None if it is not visible."""
@@ -235,7 +234,7 @@ def _flag(
     along = np.arange(-0.35 * unit_px, 0.35 * unit_px + step / 2, step)
     # Avoid the bar with its blur, and the flag's end.
     clear = bar.half_width / abs(float(flags_along @ bar.normal))
-    out = clear + np.arange(1.0, max(0.85 * flag_units * unit_px, 1.5), 0.5)
+    out = clear + np.arange(1.0, max(0.85 * FLAG_UNITS * unit_px, 1.5), 0.5)
     profile = np.zeros_like(along)
     for side in (out, -out):
         grid = guess + along[:, None, None] * bar.direction + side[None, :, None] * flags_along

@@ -108,8 +108,8 @@ class LineSeries(ReadOnlyArrays):
 def line_states(series: LineSeries) -> tuple[State, ...]:
     """State of the pool in each frame; see the module's table."""
     lit = _steady(series.count > 0)
-    _, growth, growth_sigma = local_line(series.width_mm, lit, WINDOW)
-    turn, turning, turning_sigma = local_line(series.turn, lit, WINDOW)
+    _, growth, growth_sigma = local_line(series.width_mm, lit)
+    turn, turning, turning_sigma = local_line(series.turn, lit)
     grows = _changes(growth, growth_sigma, LEAST_GROWTH_MM)
     grows = _well_known(grows, series.width_mm)
     grows = lit & _with_corners(grows, series.width_mm, lit)
@@ -147,10 +147,8 @@ def line_changes(series: LineSeries) -> list[tuple[int, int, int]]:
     return changes
 
 
-def local_line(
-    values: FloatArray, on: BoolArray, window: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit robust local lines: value, rate per window and σ of the rate, each shape (n,).
+def local_line(values: FloatArray, on: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit robust local lines: value, rate per `WINDOW` and σ of the rate, each shape (n,).
 
     Parameters
     ----------
@@ -158,8 +156,6 @@ def local_line(
         One value per frame, shape (n,), NaN if unknown.
     on
         Frames to use, shape (n,); elsewhere the result is NaN.
-    window
-        Standard deviation of the Gaussian weights, frames.
     """
     frames = np.arange(len(values), dtype=float)
     known = on & np.isfinite(values)
@@ -167,7 +163,7 @@ def local_line(
     if known.sum() < 3:
         return result[0], result[1], result[2]
     y = np.where(known, values, 0.0)
-    step = (frames - frames[:, None]) / window
+    step = (frames - frames[:, None]) / WINDOW
     weights = np.exp(-(step**2) / 2) * known
     base, noise = weights, np.full(len(values), np.inf)
     for _ in range(4):

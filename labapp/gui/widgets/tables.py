@@ -179,7 +179,8 @@ class FittingTable(CellTable):
 
     def set_cell(self, row: int, column: int, text: str, *, number: bool, tip: str = "") -> None:
         """Show a text in a cell; a line does not end directly after ±."""
-        super().set_cell(row, column, text.replace("± ", "±\N{NO-BREAK SPACE}"), number=number)
+        text = text.replace("± ", "±\N{NO-BREAK SPACE}")
+        super().set_cell(row, column, text, number=number, tip=tip)
 
 
 def _are_numbers(cells: Sequence[str | float | None]) -> bool:

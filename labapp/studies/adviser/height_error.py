@@ -54,7 +54,7 @@ def simulated_errors(trial: Trial) -> FloatArray:
         counts = (int((seen.lit & seen.blocked).sum()), int((seen.lit & ~seen.on_plane).sum()))
         rng = np.random.default_rng([sample.seed, number])
         try:
-            match = exact_match(seen, rig, sigma_mm=limits.dot_sigma_mm, rng=rng)
+            match = exact_match(seen, sigma_mm=limits.dot_sigma_mm, rng=rng)
             believed = rig
             if trial.calibrated:
                 match, believed = move(match, rig, known.axes, root @ sample.deviate[number])

@@ -31,6 +31,9 @@ SHORT_PX = 25
 ALIKE = 2.5
 """Largest ratio of brightness between parts of one line."""
 
+LONGEST_GAP_PX, MOST_TURN_DEG = 14.0, 45.0
+"""Longest gap that is joined, px, and largest turn at either side of it, degrees."""
+
 GAP_SHARE = 0.1
 """A gap may be longer by this share of the joined chains' lengths, as the pool spreads them."""
 
@@ -43,9 +46,7 @@ BRIEF = 0.3
 """Cosine of the largest turn at a short chain's end where it continues a longer one."""
 
 
-def join_chains(
-    ridges: Ridges, chosen: IntArray, scale_px: float, gap_px: float, turn_deg: float
-) -> list[IntArray]:
+def join_chains(ridges: Ridges, chosen: IntArray, scale_px: float) -> list[IntArray]:
     """Join chains to lines; return the points of each line in order.
 
     Parameters
@@ -56,8 +57,6 @@ def join_chains(
         Indices of the chains to use, shape (k,).
     scale_px
         The ridges' scale, px.
-    gap_px, turn_deg
-        Longest gap, px, and largest turn at either side of it, degrees.
     """
     parts = [
         part
@@ -65,7 +64,7 @@ def join_chains(
         for part in _parts(ridges, np.arange(ridges.starts[k], ridges.starts[k + 1]))
     ]
     chains = _without_whiskers(ridges, [_core(ridges, part) for part in parts], scale_px)
-    return _join(ridges, chains, gap_px, turn_deg)
+    return _join(ridges, chains)
 
 
 def _parts(ridges: Ridges, points: IntArray) -> list[IntArray]:
@@ -116,7 +115,7 @@ def spread_of(ridges: Ridges, points: IntArray) -> float:
     return float(np.sqrt(max(ratio, 1.0)))  # a brighter neighbour can make it meaningless
 
 
-def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float) -> list[IntArray]:
+def _join(ridges: Ridges, chains: list[IntArray]) -> list[IntArray]:
     """Join chains end to end, the best pair of ends first; return each line's points in order."""
     if not chains:
         return []
@@ -126,7 +125,7 @@ def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float
     with np.errstate(divide="ignore", invalid="ignore"):
         ahead = np.vecdot(step, out[:, None]) / length
         behind = np.vecdot(-step, out[None]) / length
-    least = np.cos(np.radians(turn_deg))
+    least = np.cos(np.radians(MOST_TURN_DEG))
     near = length < 3.0
     # The direction of a short chain is unreliable: that of the longer one decides.
     brief = np.repeat([len(chain) < WHISKER_PX for chain in chains], 2)
@@ -136,7 +135,7 @@ def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float
     fits &= np.abs(np.log(bright[:, None] / bright)) < np.log(ALIKE)
     trimmed = np.repeat([END_WIDTHS * spread_of(ridges, chain) for chain in chains], 2)
     spread = GAP_SHARE * np.repeat([float(len(chain)) for chain in chains], 2)
-    fits &= length <= gap_px + trimmed[:, None] + trimmed + spread[:, None] + spread
+    fits &= length <= LONGEST_GAP_PX + trimmed[:, None] + trimmed + spread[:, None] + spread
     # Upright chains one above the other are lines that the pool has folded together (a caustic).
     folded = np.repeat([is_upright(ridges.image_px[chain]) for chain in chains], 2)
     short = np.repeat([len(chain) < SHORT_PX for chain in chains], 2)

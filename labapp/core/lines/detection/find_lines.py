@@ -70,9 +70,6 @@ LEAST_SCALE_PX, MOST_SCALE_PX = 1.6, 4.0
 LEAST_PX = 7.0
 """Length of the shortest chain of ridge points and of the shortest line, px."""
 
-LONGEST_GAP_PX, MOST_TURN_DEG = 14.0, 45.0
-"""Longest gap that is joined, px, and largest turn at either side of it, degrees."""
-
 SMOOTH_PX, SMOOTH_WIDTHS, SMOOTH_SHARE = 6.0, (3.0, 4.5), 0.05
 """Standard deviation of the Gaussian weights that smooth a line along its length: at least this
 many px; otherwise a share of its length, limited to the two multiples of its width."""
@@ -143,7 +140,7 @@ def find_lines(frame: Image) -> tuple[LightLine, ...]:
     width = float(np.sqrt(max(np.median(ratio) - SCALE_PX**2, 0.0)))
     scale = float(np.clip(width, LEAST_SCALE_PX, MOST_SCALE_PX))
     ridges = find_ridges(frame, scale)
-    joined = join_chains(ridges, _long_chains(ridges), scale, LONGEST_GAP_PX, MOST_TURN_DEG)
+    joined = join_chains(ridges, _long_chains(ridges), scale)
     picture = np.ascontiguousarray(frame, np.float32)
     picture = picture - glow(picture)
     found = (_line(picture, ridges, one, scale) for one in joined)

@@ -151,7 +151,7 @@ def check(
     kept = []
     for n, (one, checked) in enumerate(zip(chosen, found.pictures, strict=True)):
         progress(len(chosen) + 1 + n, parts, f"measuring {one.mirror.name}")
-        kept.append(_kept(one, checked, found, setup.calibration))
+        kept.append(_kept(one, checked, setup.calibration))
     changes = found.changes
     columns = ("before", "before_sigma", "after", "after_sigma")
     values = {name: np.array([getattr(one, name) for one in changes]) for name in columns}
@@ -194,9 +194,7 @@ def _of_pool(
     return (before.total_sigma_mm, after.total_sigma_mm), blind
 
 
-def _kept(
-    one: ListedPicture, checked: CheckedPicture, found: BenchCheck, before: ImageCalibration
-) -> MirrorPicture:
+def _kept(one: ListedPicture, checked: CheckedPicture, before: ImageCalibration) -> MirrorPicture:
     dots = checked.picture.dots
     dot_px = np.column_stack([dots.u_px, dots.v_px])[checked.dot]
     return MirrorPicture(

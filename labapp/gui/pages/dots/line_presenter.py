@@ -14,7 +14,7 @@ from labapp.core.lines.frame import LineFrame
 from labapp.core.values import BoolArray, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
-from labapp.session.results.measured import CORRECTION_CHANGED, Result
+from labapp.session.results.measured import CORRECTION_CHANGED
 from labapp.session.session import Session
 from labapp.text import pluralize
 
@@ -97,7 +97,7 @@ def show_lines(session: Session, frame: int) -> LinesState:
     correction = correction or LineCorrection.of(found.seen)
     words = ("Corrected by hand: " if by_hand else "") + _words(found)
     why = "; ".join(result.stale) or found.reason
-    state = LinesState(words, rows=_rows(found, result), why=why, correction=correction)
+    state = LinesState(words, rows=_rows(found), why=why, correction=correction)
     return _with_lines(state, line_names(found, correction.number), by_hand, due)
 
 
@@ -164,7 +164,7 @@ def _listed(name: str, one: LightLine) -> tuple[str, ...]:
     return name, f"{one.length_px:.0f}", f"{one.width_px:.1f}", f"{one.gap_px:.0f}", shape
 
 
-def _rows(found: LineFrame, result: Result) -> tuple[ResultRow, ...]:
+def _rows(found: LineFrame) -> tuple[ResultRow, ...]:
     seen, surface = found.features, found.surface
     rows = [
         ResultRow("Lines", str(seen.count), note="How many of the pattern's lines are seen"),
