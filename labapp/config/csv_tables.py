@@ -113,8 +113,8 @@ class NumberCells:
 
 def read_columns(
     path: Path, wanted: str, largest: int, words: Collection[str] = ()
-) -> dict[str, list[str] | FloatArray]:
-    """Columns of a table by name; the separator is a comma, a semicolon or a tab.
+) -> tuple[dict[str, list[str]], dict[str, FloatArray]]:
+    """Columns of text and of numbers, by name; the separator is a comma, a semicolon or a tab.
 
     Parameters
     ----------
@@ -154,4 +154,4 @@ def read_columns(
                 if value is None:
                     raise InputError(path, f"line {line}, {name}", cell, number.expected)
                 numbers[name].append(value)
-    return {name: texts[name] if name in texts else np.array(numbers[name]) for name in names}
+    return texts, {name: np.array(values) for name, values in numbers.items()}

@@ -210,16 +210,15 @@ class FeatureTable:
             If it is not such a table.
         """
         path = Path(path)
-        read = read_columns(path, WANTED, LARGEST, ("recording",))
-        names = read.pop("recording", None)
-        columns = {name: of for name, of in read.items() if isinstance(of, np.ndarray)}
+        words, columns = read_columns(path, WANTED, LARGEST, ("recording",))
+        names = words.get("recording")
         for name, values in columns.items():
             if "_sigma" in name and (values < 0).any():
                 raise InputError(path, name, f"{values[values < 0][0]:g}", "0 or more, or nothing")
         features = tuple(name for name in columns if name in WITH_SIGMA)
-        if not isinstance(names, list) or "time_s" not in columns or not features or not names:
+        if not names or "time_s" not in columns or not features:
             right = f"rows with recording, time_s and some of {', '.join(WITH_SIGMA)}"
-            raise InputError(path, "columns", ", ".join(read) or "none", right)
+            raise InputError(path, "columns", ", ".join(columns) or "none", right)
         known = {"time_s", *features, *(sigma_name(f, part) for f in features for part in PARTS)}
         others = [name for name in columns if name not in known]
         targets = [name for name in others if sigma_name(name) in others or len(others) == 1]

@@ -81,13 +81,12 @@ def _read(
     plan: StudyPlan, path: Path
 ) -> tuple[str, np.ndarray, FloatArray, FloatArray, FloatArray]:
     """Read the name of the penetration; recording, time, penetration and ± of each section."""
-    read = read_columns(path, WANTED, LARGEST_FILE, ("recording",))
-    names = read.pop("recording", None)
-    columns = {name: of for name, of in read.items() if isinstance(of, np.ndarray)}
+    words, columns = read_columns(path, WANTED, LARGEST_FILE, ("recording",))
+    names = words.get("recording")
     others = [name for name in columns if name not in PLACES]
     targets = [name for name in others if len(others) == 1 or sigma_name(name) in others]
-    if not isinstance(names, list) or not names or len(targets) != 1 or len(others) > 2:
-        raise InputError(path, "columns", ", ".join(read) or "none", WANTED)
+    if not names or len(targets) != 1 or len(others) > 2:
+        raise InputError(path, "columns", ", ".join(columns) or "none", WANTED)
     target = targets[0]
     if target in RESERVED:
         right = "another name: a size of the pool has this one"
