@@ -12,12 +12,12 @@ from PySide6.QtCore import QObject, Signal
 
 from labapp.config.setup_text import frame_px_of, three_points
 from labapp.errors import InputError
-from labapp.gui.shell.steps import calibrations_in_use
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import selectable_label, show_words
 from labapp.gui.widgets.layouts import row_of
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
+from labapp.session.calibrations import calibrations_in_use
 from labapp.session.record import Recording
 from labapp.session.session import Session
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from labapp.core.geometry.uncertainty import ENDINGS
 from labapp.errors import InputError
+from labapp.session.calibrations import calibrations_in_use
 from labapp.session.results.statuses import is_failed
 from labapp.text import pluralize, split_unit
 
@@ -120,33 +117,6 @@ def why_not_measurable(session: Session) -> str:
         return gone
     to_do = setup_to_do(session.setup_problems)
     return f"The set-up is not complete. {to_do}" if to_do else ""
-
-
-def calibrations_in_use(session: Session) -> tuple[bool, bool]:
-    """Whether the set-up contains the calibrated values of laser and imaging plane.
-
-    False without a calibration and if other values were entered after it.
-    """
-    keys = tomllib.loads(session.setup_text)
-    laser, plane = session.laser_calibration, session.plane_calibration
-    return (
-        laser is not None and _entered(keys.get("laser"), laser.found.setup_keys),
-        plane is not None
-        and all(_entered(keys.get(name), own) for name, own in plane.found.setup_keys.items()),
-    )
-
-
-def _entered(keys: Any, found: Mapping[str, Any]) -> bool:
-    """Whether a section of the set-up contains the found values, except for rounding."""
-    try:
-        pairs = [
-            (keys[name], value)
-            for name, value in found.items()
-            if value is not None and not name.endswith(ENDINGS)
-        ]
-        return all(np.allclose(one, other, rtol=1e-6) for one, other in pairs)
-    except (KeyError, TypeError, ValueError):
-        return False
 
 
 @dataclass(frozen=True)

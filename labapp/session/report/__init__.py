@@ -13,13 +13,10 @@ import scipy
 
 from labapp.config.setup import Setup
 from labapp.core.calibration.board_calibration import BoardCalibration
-from labapp.core.calibration.laser_calibration import LaserCalibration
-from labapp.core.calibration.plane_calibration import PlaneCalibration
-from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.errors import InputError
 from labapp.media.base import format_frame_rate
+from labapp.session.calibrations import calibrations_in_use
 from labapp.session.checklist import ticked
 from labapp.session.contents import SessionContents
 from labapp.session.report import data, figures
@@ -244,7 +241,7 @@ def _laser(story: Story, report: ReportData) -> None:
             *(("warning", warning) for warning in found.warnings),
         ]
     )
-    if report.setup is not None and not _is_laser(found, report.setup.rig):
+    if report.setup is not None and not calibrations_in_use(report.session)[0]:
         story.text(_changed("The rig's laser", report.setup))
 
 
@@ -292,8 +289,10 @@ def _plane(story: Story, report: ReportData) -> None:
     )
     if isinstance(found, BoardCalibration) or found.fits is not None:
         story.text("; ".join(" ".join(line.split()) for line in found.fit_lines()) + ".")
-    if report.setup is not None and not _is_calibration(found, report.setup.calibration):
-        story.text(_changed("The image calibration", report.setup))
+    setup = report.setup
+    _, in_use = calibrations_in_use(report.session)
+    if setup is not None and (setup.calibration.distortion_percent or not in_use):
+        story.text(_changed("The image calibration", setup))
     try:
         picture = report.session.picture(plane.picture_sha256)
     except InputError as error:
@@ -338,19 +337,3 @@ def _bench_check(story: Story, report: ReportData) -> None:
     )
     if report.setup is not None and not report.setup.check_date:
         story.text("The set-up was changed after this check: it is not checked.")
-
-
-def _is_laser(found: LaserCalibration, rig: Rig) -> bool:
-    """Whether the rig's laser has the position of this calibration."""
-    laser = rig.laser
-    known = [found.angle_deg, found.distance_mm], [laser.projection_angle_deg, laser.distance_mm]
-    return bool(np.allclose(*known, rtol=1e-6))
-
-
-def _is_calibration(
-    found: PlaneCalibration | BoardCalibration, calibration: ImageCalibration
-) -> bool:
-    """Whether the image calibration is the one determined from the picture."""
-    original = found.image_calibration
-    same = np.allclose(original.matrix, calibration.matrix, rtol=1e-6, atol=1e-9)
-    return bool(same) and (original.lens is None) == (calibration.lens is None)

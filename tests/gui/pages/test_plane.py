@@ -23,9 +23,10 @@ from labapp.core.values import CannotMeasure
 from labapp.gui.pages.plane import page as plane_page_module
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.page import PlanePage
-from labapp.gui.shell.steps import calibrations_in_use, states
+from labapp.gui.shell.steps import states
 from labapp.gui.tasks import DONE
 from labapp.gui.workspace import Workspace
+from labapp.session.calibrations import calibrations_in_use
 from labapp.session.session import Session
 from labapp.simulation.calibration.board import board_svg
 from labapp.simulation.calibration.target import Target, TargetLook, render_target, target_svg

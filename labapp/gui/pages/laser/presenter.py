@@ -15,7 +15,7 @@ from labapp.core.calibration.laser_calibration import (
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, parsed
 from labapp.gui.pages.setup.presenter import shown as setup_shown
-from labapp.gui.shell.steps import calibrations_in_use
+from labapp.session.calibrations import calibrations_in_use
 from labapp.session.session import Session
 from labapp.text import pluralize
 

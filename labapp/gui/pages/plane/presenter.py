@@ -22,8 +22,8 @@ from labapp.core.calibration.plane_calibration import (
 from labapp.core.geometry.coordinates import Lens
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, round_factor
-from labapp.gui.shell.steps import calibrations_in_use
 from labapp.media import GreyImage
+from labapp.session.calibrations import calibrations_in_use
 from labapp.session.session import Session
 from labapp.simulation.calibration.target import Target
 
