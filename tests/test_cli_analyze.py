@@ -9,6 +9,7 @@ import cv2
 import pytest
 
 from labapp.studies import error_analysis
+from labapp.studies.analysis import TABLES
 from tests.conftest import Run
 
 DATA = Path(__file__).parent / "data"
@@ -84,6 +85,7 @@ def test_selected_parts_of_the_errors_are_written(labapp: Run, tmp_path: Path) -
     caps = table(tmp_path / "errors_by_cap.csv")
     assert [row["height_mm"] for row in caps] == ["0.3"] * 5 + ["-0.3"] * 5 + ["0.3", "-0.3"]
     assert len({row["center_x_mm"] for row in caps[:10]}) == 10
+    assert {path.stem for path in tmp_path.glob("*.csv")} == {*TABLES["CE"], *TABLES["LE"]}
     assert sorted(path.stem for path in tmp_path.glob("*.png")) == [
         "figure_8_6_CE",
         "figure_8_7_CE_are",
@@ -93,10 +95,36 @@ def test_selected_parts_of_the_errors_are_written(labapp: Run, tmp_path: Path) -
 
 
 @pytest.mark.usefixtures("few_caps")
+def test_parts_share_a_folder_and_replace_only_unchanged_files(
+    labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "chapters"
+    errors = ("analyze", "errors", "--out", folder, "--scheme", "ers", "--part")
+    assert labapp("analyze", "correspondence", "--out", folder)[0] == 0
+    assert labapp(*errors, "parameters", "--draws", "10")[0] == 0
+    (folder / "table_4_4_correspondence_concave.md").write_text("with notes")
+    (folder / "errors.csv").write_text("mine")
+    assert labapp(*errors, "parameters", "--draws", "11")[0] == 0  # beside the changed one
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert {"table_4_5_correspondence_convex.csv", "parameter_deviation.csv"} < before.keys()
+    monkeypatch.setattr(error_analysis, "survey", pytest.fail)  # not after minutes of computing
+    for arguments, name in (
+        ((*errors, "CE"), "errors.csv"),
+        (("analyze", "correspondence", "--out", folder), "table_4_4"),
+    ):
+        code, _, err = labapp(*arguments)
+        assert code == 2
+        assert name in err
+        assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.usefixtures("few_caps")
 def test_other_parts_are_written_to_tables(labapp: Run, tmp_path: Path) -> None:
     arguments = ("--part", "measurement", "--part", "parameters", "--scheme", "ers")
     arguments += ("--frames", "1", "--draws", "10")
     assert labapp("analyze", "errors", "--out", str(tmp_path), *arguments)[0] == 0
+    names = {path.stem for path in tmp_path.glob("*.csv")}
+    assert names == {*TABLES["measurement"], *TABLES["parameters"]}
     tack = table(tmp_path / "measurement_error.csv")
     assert [row["text"] for row in tack] == ["9.12", "1.4903", "0.18815"]
     assert float(tack[0]["frames_mean"]) < 10

@@ -18,13 +18,11 @@ import typer.main
 
 from labapp.core.schemes import SCHEMES, algorithm_names, scheme_words
 from labapp.errors import InputError, os_errors_as_input
-from labapp.files import write_file
 from labapp.session.results.statuses import is_failed
 from labapp.system import quoted
 from labapp.text import pluralize
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
@@ -404,13 +402,6 @@ def writable_folder(folder: Path, option: str = "--out") -> Path:
         with TemporaryFile(dir=folder):
             pass
     return folder
-
-
-def write_figure(folder: Path, name: str, figure: Figure, kind: str) -> None:
-    """Write a picture, PNG or SVG."""
-    from labapp.studies.plotting import as_bytes
-
-    write_file(folder / f"{name}.{kind}", as_bytes(figure, kind))
 
 
 @contextmanager

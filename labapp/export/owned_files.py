@@ -13,7 +13,6 @@ from pathlib import Path
 
 from labapp.errors import InputError, os_errors_as_input
 from labapp.files import as_bytes, read_limited, sha256_of, write_file
-from labapp.text import now
 from labapp.version import VERSION
 
 LARGEST_RECORD = 1 << 28
@@ -37,9 +36,30 @@ def check_owned(folder: Path, command: str, names: Collection[str] = ()) -> None
         If one of the names is a file that the command did not write, an earlier file has changed
         since, or either is a link.
     """
+    _check(folder, command, {*_recorded(folder, command), *names})
+
+
+def check_added(folder: Path, command: str, names: Collection[str]) -> None:
+    """Check that a command may write files beside its earlier ones; others are not looked at.
+
+    Parameters
+    ----------
+    folder, command, names
+        See `check_owned`.
+
+    Raises
+    ------
+    InputError
+        As `check_owned`, for these names.
+    """
+    _check(folder, command, names)
+
+
+def _check(folder: Path, command: str, names: Collection[str]) -> None:
+    """Check that a command may write these files."""
     recorded = _recorded(folder, command)
     expected = "another folder, or this file moved out of it"
-    for name in sorted({f"{command}.json", *recorded, *names}):
+    for name in sorted({f"{command}.json", *names}):
         path = folder / name
         if path.is_symlink():
             raise InputError(folder, name, "is a link", expected)
@@ -75,14 +95,38 @@ def write_owned(folder: Path, command: str, files: Mapping[str, bytes]) -> None:
     with os_errors_as_input(folder, "folder", "one that can be written"):
         for name in recorded.keys() - files.keys():
             (folder / name).unlink(missing_ok=True)
+    _write(folder, command, files, {})
+
+
+def add_owned(folder: Path, command: str, files: Mapping[str, bytes]) -> None:
+    """Write files beside a command's earlier ones, and record their checksums with those.
+
+    Parameters
+    ----------
+    folder, command, files
+        See `write_owned`.
+
+    Raises
+    ------
+    InputError
+        As `check_added`, before anything is written; or if a file cannot be written.
+    """
+    check_added(folder, command, files)
+    _write(folder, command, files, _recorded(folder, command))
+
+
+def _write(
+    folder: Path, command: str, files: Mapping[str, bytes], others: Mapping[str, str]
+) -> None:
+    """Write files, and the record of these and of others, checksums by name."""
     for name, content in files.items():
         write_file(folder / name, content)
+    checksums = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     record = {
         "program": "labapp",
         "version": VERSION,
         "command": command,
-        "written": now(),
-        "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
+        "files": {**others, **checksums},
     }
     text = json.dumps(record, indent=2, ensure_ascii=False) + "\n"
     write_file(folder / f"{command}.json", as_bytes(text))

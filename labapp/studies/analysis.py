@@ -25,6 +25,14 @@ if TYPE_CHECKING:
 PARTS = ("CE", "LE", "ME", "measurement", "images", "parameters")
 """Parts of the analysis."""
 
+TABLES = {
+    **dict.fromkeys(("CE", "LE", "ME"), ("errors", "are", "errors_by_cap")),
+    "measurement": ("measurement_error",),
+    "images": ("image_processing_error",),
+    "parameters": ("parameter_deviation",),
+}
+"""Names of the tables of each part."""
+
 FIGURES = {"CE": (6, 7), "LE": (8, 9), "ME": (10, 11)}
 """Numbers of the figures in chapter 8 that show errors and ARE."""
 
@@ -98,7 +106,7 @@ def _surveys(options: AnalysisOptions, progress: Progress | None) -> Iterator[An
         }
         tables = (*short, error_analysis.cap_table(done))
         yield AnalysisPart(
-            tables, _drawn(drawn, options.picture), short if kind == kinds[-1] else ()
+            tables, drawn_files(drawn, options.picture), short if kind == kinds[-1] else ()
         )
 
 
@@ -115,7 +123,7 @@ def _measurement(options: AnalysisOptions, progress: Progress | None) -> Analysi
     frame = image_error.rendered(image_error.TACK, image_error.TACK_RIG, 0)
     drawn = {"figure_8_2_thumb_tack": pictures.frame_picture(frame)}
     table = image_error.thumb_tack_table(found[0], options.schemes)
-    return AnalysisPart((table,), _drawn(drawn, options.picture), (table,))
+    return AnalysisPart((table,), drawn_files(drawn, options.picture), (table,))
 
 
 def _images(options: AnalysisOptions, progress: Progress | None) -> AnalysisPart:
@@ -158,10 +166,11 @@ def _parameters(options: AnalysisOptions, progress: Progress | None) -> Analysis
         label = f"standard uncertainty of the height, {surface} 6 mm × 0.3 mm (%)"
         drawn[f"parameter_deviation_{surface}"] = pictures.bars_picture(names, values, label)
     table = deviation.deviation_table(found)
-    return AnalysisPart((table,), _drawn(drawn, options.picture), (table,))
+    return AnalysisPart((table,), drawn_files(drawn, options.picture), (table,))
 
 
-def _drawn(figures: Mapping[str, Figure], kind: str) -> dict[str, bytes]:
+def drawn_files(figures: Mapping[str, Figure], kind: str) -> dict[str, bytes]:
+    """Pictures by file name, PNG or SVG."""
     from labapp.studies.plotting import as_bytes
 
     return {f"{name}.{kind}": as_bytes(figure, kind) for name, figure in figures.items()}
@@ -210,7 +219,7 @@ def analyze_budget(
     values = {"predicted": predicted, "simulated": simulated}
     label = f"standard uncertainty of the height, fit (% of {abs(pool.peak_mm):g} mm)"
     drawn = {table.name: bars_picture(names, values, label)}
-    return AnalysisPart((table,), _drawn(drawn, "png"), (table,))
+    return AnalysisPart((table,), drawn_files(drawn, "png"), (table,))
 
 
 def _rig(setup: Setup | None) -> Rig:

@@ -93,6 +93,10 @@ def test_budget_is_computed_for_the_setup_of_the_session(
     table.copy_csv()
     expected = (tmp_path / "command" / "error_budget.csv").read_text("utf-8")
     assert QApplication.clipboard().text() == expected
+    (tmp_path / "window" / "error_budget.md").write_text("with notes")
+    analysis.save(tmp_path / "window")
+    assert "error_budget.md" in analysis.message.text()
+    assert (tmp_path / "window" / "error_budget.md").read_text() == "with notes"
     analysis.save(setup / "below a file")
     assert "expected one that can be written" in analysis.message.text()
     analysis.which.set_value("error_budget.png")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
@@ -15,21 +15,24 @@ from labapp.cli.shared import (
     results_folder,
     warned,
     writable_folder,
-    write_figure,
 )
 from labapp.errors import InputError
-from labapp.files import write_file
+from labapp.export.owned_files import add_owned, check_added
 from labapp.studies import SCHEME_NAMES
 from labapp.studies.analysis import (
     PARTS,
+    TABLES,
     AnalysisOptions,
     AnalysisPart,
     analyze_budget,
     analyze_errors,
+    drawn_files,
     expected_pool,
 )
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from labapp.studies.tables import Table
 
 T = TypeVar("T", bound=str)
@@ -38,7 +41,10 @@ app = command_group()
 
 Out = Annotated[
     Path | None,
-    typer.Option(help="Folder for tables (CSV, Markdown) and pictures; files in it are replaced."),
+    typer.Option(
+        help="Folder for tables (CSV, Markdown) and pictures. Earlier ones are replaced if "
+        "unchanged."
+    ),
 ]
 Tables = Annotated[
     bool, typer.Option("--tables", help="Print the tables; without --out nothing is written.")
@@ -53,14 +59,17 @@ def positioning(out: Out = None, tables: Tables = False, picture: Format = "png"
 
     placements = study.coverage()
     computed = (*study.blocking_tables(), study.clearance_table(), study.coverage_table(placements))
-    folder = _write_tables(out, tables, computed)
-    if folder is not None:
+
+    def draw() -> dict[str, Figure]:
         from labapp.studies import pictures
 
-        write_figure(folder, "figure_4_11_coverage", pictures.coverage_picture(placements), picture)
         rig = study.positioning_rig(30.0)
-        side = pictures.positioning_picture(rig, 6.0, 6.0, 0.3)
-        write_figure(folder, "figure_4_7_positioning", side, picture)
+        return {
+            "figure_4_11_coverage": pictures.coverage_picture(placements),
+            "figure_4_7_positioning": pictures.positioning_picture(rig, 6.0, 6.0, 0.3),
+        }
+
+    _write_tables(out, tables, computed, draw, picture)
 
 
 @app.command()
@@ -68,21 +77,24 @@ def correspondence(out: Out = None, tables: Tables = False, picture: Format = "p
     """Tabulate the order of reflected rows and columns by size and depth of the pool (§4.2.2)."""
     from labapp.studies import correspondence_table as study
 
-    computed = study.correspondence_tables()
-    folder = _write_tables(out, tables, computed)
-    if folder is not None:
+    def draw() -> dict[str, Figure]:
         from labapp.studies import pictures
 
-        for name, title, radius, depth in study.EXAMPLES:
-            reflections = study.cap_reflections(radius, depth)
-            figure = pictures.correspondence_picture(reflections, title)
-            write_figure(folder, name, figure, picture)
+        return {
+            name: pictures.correspondence_picture(study.cap_reflections(radius, depth), title)
+            for name, title, radius, depth in study.EXAMPLES
+        }
+
+    _write_tables(out, tables, study.correspondence_tables(), draw, picture)
 
 
 @app.command()
 def errors(
     out: Annotated[
-        Path, typer.Option(help="Folder for tables and pictures; files in it are replaced.")
+        Path,
+        typer.Option(
+            help="Folder for tables and pictures. Earlier ones are replaced if unchanged."
+        ),
     ],
     part: Annotated[
         list[str] | None,
@@ -126,6 +138,7 @@ def errors(
         picture,
     )
     folder = writable_folder(out)
+    _check_tables(folder, *(name for each in options.parts for name in TABLES[each]))
     with progress_shown() as progress:
         for finished in analyze_errors(options, progress):
             _write(folder, finished)
@@ -201,6 +214,7 @@ def budget(
     read = None if setup is None else warned(read_setup(setup))
     pool = expected_pool(width, length, height)
     folder = results_folder(out)
+    _check_tables(folder, "error_budget")
     with progress_shown() as progress:
         _write(folder, analyze_budget(read, pool, progress))
 
@@ -213,17 +227,30 @@ def _chosen(option: str, requested: list[str] | None, known: tuple[T, ...]) -> t
     return tuple(name for name in known if name in (requested or known))
 
 
-def _write_tables(out: Path | None, printed: bool, tables: Sequence[Table]) -> Path | None:
-    """Write tables, and print them if requested; returns the folder."""
+def _check_tables(folder: Path | None, *names: str) -> None:
+    """Check that tables may be written, before they are computed."""
+    if folder is not None:
+        check_added(
+            folder, "analyze", [f"{name}.{kind}" for name in names for kind in ("csv", "md")]
+        )
+
+
+def _write_tables(
+    out: Path | None,
+    printed: bool,
+    tables: Sequence[Table],
+    draw: Callable[[], Mapping[str, Figure]] = dict,
+    picture: str = "png",
+) -> None:
+    """Write tables and pictures, which are drawn only then; print the tables if requested."""
     folder = results_folder(out, printed)
-    _write(folder, AnalysisPart(tuple(tables), {}, tuple(tables) if printed else ()))
-    return folder
+    pictures = {} if folder is None else drawn_files(draw(), picture)
+    _write(folder, AnalysisPart(tuple(tables), pictures, tuple(tables) if printed else ()))
 
 
 def _write(folder: Path | None, part: AnalysisPart) -> None:
     """Write the results of a part, and print its short tables."""
     if folder is not None:
-        for name, content in part.files.items():
-            write_file(folder / name, content)
+        add_owned(folder, "analyze", part.files)
     for table in part.printed:
         typer.echo(table.markdown())

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QCheckBox, QSizePolicy, QStackedWidget, QWidget
 
+from labapp.export.owned_files import add_owned
 from labapp.gui.tasks import Control
 from labapp.gui.tools import analysis_presenter as presenter
 from labapp.gui.tools.analysis_presenter import BUDGET, OPENED, PARTS, USUAL
@@ -41,8 +42,9 @@ SIZES = (
 class AnalysisWindow(ToolWindow):
     """Computes parts of chapter 8 and the uncertainty budget of a set-up, and shows each result."""
 
-    key = "analysis"
+    key, command = "analysis", "analyze"
     title = "Error analysis"
+    write = staticmethod(add_owned)
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
         self.tables: dict[str, Table] = {}

@@ -14,7 +14,6 @@ from PySide6.QtWidgets import QDialog, QHBoxLayout, QProgressBar, QPushButton, Q
 
 from labapp.errors import os_errors_as_input
 from labapp.export.owned_files import write_owned
-from labapp.files import write_file
 from labapp.gui.dialogs import ask_folder
 from labapp.gui.tasks import PROBLEM, Control, Task, Tasks
 from labapp.gui.widgets.buttons import button
@@ -43,10 +42,9 @@ class ToolWindow(QDialog):
     key = ""
     title = ""
     command = ""
-    """Name in code, name for the operator, and the command whose unchanged files are replaced.
+    """Name in code, name for the operator, and the command whose files Save writes."""
 
-    Without a command all files of the same names are replaced, as ``labapp analyze`` does.
-    """
+    write = staticmethod(write_owned)
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
         super().__init__(window)
@@ -213,16 +211,12 @@ class ToolWindow(QDialog):
             self.save(folder)
 
     def save(self, folder: Path) -> None:
-        """Write the results, as the command does; each file atomically."""
+        """Write the results, as the command does."""
 
         def write() -> Path:
             with os_errors_as_input(folder, "folder", "one that can be written"):
                 folder.mkdir(parents=True, exist_ok=True)
-            if self.command:
-                write_owned(folder, self.command, self.files)
-                return folder
-            for name, content in self.files.items():
-                write_file(folder / name, content)
+            self.write(folder, self.command, self.files)
             return folder
 
         if self.workspace.run_or_report(write):
