@@ -230,6 +230,35 @@ def copy_during_change(path: Path) -> Path:
     return copy
 
 
+FULL_DISK = """
+    import resource, sys
+    from labapp.errors import InputError
+    from labapp.session.file.database import Database
+
+    database = Database.open(sys.argv[1])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
+    try:
+        with database.transaction() as connection:
+            connection.execute("PRAGMA cache_size = 1")
+            for number in range(100):
+                connection.execute(
+                    "INSERT INTO document (kind, frame, sha256, content) VALUES ('x', ?, '', ?)",
+                    (number, bytes(8000)),
+                )
+    except InputError as error:
+        print(error.field)
+    database.close()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit for the size of a file")
+def test_full_disk_leaves_the_file_as_it_was(path: Path):
+    before = path.read_bytes()
+    assert run_python(FULL_DISK, path).strip() == "disk"
+    assert path.read_bytes() == before
+    assert [entry.name for entry in path.parent.glob("*-journal")] == []
+
+
 def test_interrupted_change_is_rolled_back(path: Path):
     database = Database.open(copy_during_change(path))
     assert kinds(database) == ["one"]

@@ -13,7 +13,7 @@ import stat
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -225,6 +225,9 @@ class Database:
                 # A full disk may have ended the transaction already.
                 if not nested and self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
+                if not nested:
+                    with suppress(sqlite3.Error):  # the error to report is the first one
+                        _roll_back(self._connection)
                 raise
 
     def problems(self) -> list[str]:
