@@ -4,6 +4,6 @@ import multiprocessing
 
 if __name__ == "__main__":
     multiprocessing.freeze_support()  # a process that measures starts this program again
-    from labapp.cli import main
+    from labapp.__main__ import main
 
     main()

@@ -358,6 +358,29 @@ def test_signal_in_a_compiler_callback_stops_the_program(sent: signal.Signals, c
     assert "Traceback" not in done.stderr
 
 
+INTERRUPTED_AT_THE_START = """
+import runpy, signal, sys
+
+class Pressed:
+    def find_spec(self, name, *_):
+        if name == "labapp.cli.shared":
+            signal.raise_signal(signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Pressed())
+runpy.run_module("labapp", run_name="__main__")
+"""
+
+
+def test_ctrl_c_while_the_commands_are_loaded_stops_the_program() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_AT_THE_START],
+        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
 @pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_stopped_run_leaves_complete_frames(
     tmp_path: Path, signal_number: signal.Signals, code: int
