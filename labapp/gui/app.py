@@ -110,7 +110,11 @@ def open_window(
     gc.disable()  # see `collect_garbage`
     heartbeat.start(HEARTBEAT_MS)
     stops = (signal.SIGINT, signal.SIGTERM)
-    former = {number: signal.signal(number, lambda *_: window.close()) for number in stops}
+
+    def stop(*_: object) -> None:
+        QTimer.singleShot(0, window, window.close)  # not in the middle of what the window does
+
+    former = {number: signal.signal(number, stop) for number in stops}
     window.show()
     first_use = FirstUse(window.workspace.tasks, window)
     closed = threading.Event()

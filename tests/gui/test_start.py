@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from labapp.gui import app, compiling
+from tests.gui.conftest import CopySample
 
 pytestmark = pytest.mark.usefixtures("state")  # the user's drafts load more modules
 
@@ -54,6 +55,19 @@ with open_window(app, Preferences(), Path(sys.argv[1])) as window:
     QTimer.singleShot(0, window, lambda: os.kill(os.getpid(), signal.SIGTERM))
     ended = app.exec()
 print(ended, window.isVisible(), Path(sys.argv[1]).exists())
+"""
+
+STOPPED_WHILE_OPENING = """
+import os, signal, sys
+from pathlib import Path
+from labapp.gui.app import open_window, start_app
+from labapp.gui.preferences import Preferences
+app = start_app()
+with open_window(app, Preferences(), Path(sys.argv[1]), Path(sys.argv[2])) as window:
+    window.workspace.notified.connect(lambda text, _: print("said", text))
+    window.workspace.opened.connect(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    ended = app.exec()
+print(ended, window.isVisible())
 """
 
 GARBAGE = """
@@ -114,6 +128,11 @@ def test_surface_page_loads_no_modules_for_other_files():
 
 def test_sigterm_closes_the_window(tmp_path: Path):
     assert words_of(STOPPED, tmp_path / "preferences.json") == {"0", "False", "True"}
+
+
+def test_stop_signal_waits_until_a_session_is_open(tmp_path: Path, copy_sample: CopySample):
+    arguments = (tmp_path / "preferences.json", copy_sample("gtaw"))
+    assert words_of(STOPPED_WHILE_OPENING, *arguments) == {"0", "False"}
 
 
 def test_widgets_are_deleted_in_the_main_thread_only(tmp_path: Path):
