@@ -13,8 +13,12 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from labapp.errors import InputError, os_errors_as_input
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 
 def as_bytes(text: str) -> bytes:
@@ -135,6 +139,26 @@ def is_of_labapp(path: Path) -> bool:
     return isinstance(content, dict) and content.get("program") == "labapp"
 
 
+def acquire(lock: FileLock) -> None:
+    """Acquire a lock without waiting.
+
+    Raises
+    ------
+    filelock.Timeout
+        If another program has it.
+    OSError
+        If there can be no such file; the library calls that a lock of another program.
+    """
+    from filelock import Timeout
+
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        if os.path.lexists(lock.lock_file):
+            raise
+        raise OSError(errno.EROFS, "no file can be made in it") from None
+
+
 @contextmanager
 def only_writer(target: Path) -> Iterator[bool]:
     """Exclude other programs from writing to a file or folder, by a lock file beside it.
@@ -151,7 +175,7 @@ def only_writer(target: Path) -> Iterator[bool]:
     path = target.parent / f".{target.name}.lock"  # "/" has no name
     lock = FileLock(path)
     try:
-        lock.acquire(blocking=False)
+        acquire(lock)
     except Timeout as error:
         raise InputError(
             target, "folder", "is being written by another program", "to wait for it"

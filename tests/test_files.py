@@ -104,6 +104,12 @@ def test_only_the_permitted_size_is_read(tmp_path: Path):
         read_limited(tmp_path / "none", 4, "digits")
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no /proc here")
+def test_folder_without_files_is_not_taken_for_a_locked_one():
+    with only_writer(Path("/proc/self/out")) as locked:
+        assert not locked
+
+
 def test_second_writer_is_rejected_until_the_first_is_done(tmp_path: Path):
     target = tmp_path / "out"
     with only_writer(target):

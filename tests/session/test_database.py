@@ -156,6 +156,14 @@ def test_second_writer_is_rejected_but_can_read(path: Path):
     Database.open(path).close()
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no /proc here")
+def test_folder_without_files_is_not_taken_for_another_writer():
+    with pytest.raises(InputError) as caught:
+        Database.create("/proc/self/a.labsession")
+    assert not isinstance(caught.value, SessionInUse)
+    assert caught.value.field == "folder"
+
+
 def test_second_writer_through_a_link_is_rejected(path: Path, tmp_path: Path):
     (tmp_path / "elsewhere").mkdir()
     link = tmp_path / "elsewhere" / "link.labsession"

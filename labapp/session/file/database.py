@@ -23,7 +23,7 @@ import numpy.typing as npt
 from filelock import FileLock, Timeout
 
 from labapp.errors import PATH, InputError, os_errors_as_input, require
-from labapp.files import atomic_file, regular_size
+from labapp.files import acquire, atomic_file, regular_size
 from labapp.session.file.schema import APPLICATION_ID, MIGRATIONS, TABLES, VERSION
 
 SUFFIX = ".labsession"
@@ -399,7 +399,7 @@ def _lock(path: Path) -> FileLock:
     try:
         if not path.parent.is_dir():
             raise NotADirectoryError(20, "does not exist")
-        lock.acquire(blocking=False)
+        acquire(lock)
     except Timeout as error:
         raise SessionInUse(
             path,
