@@ -31,6 +31,7 @@ from labapp.config.toml_keys import (
     shown,
     unknown_key,
 )
+from labapp.config.view_check import view_problems
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.line_pattern import KIND as LINES
@@ -51,9 +52,6 @@ if TYPE_CHECKING:  # see `labapp.config.bench_check`
     from labapp.core.bench_check.check import BenchCheck
 
 A_SETUP = "a setup file (TOML, UTF-8)"
-
-LEAST_ANGLE_DEG = 10.0
-"""Smallest angle between the axes in the picture; a smaller one is taken for an input error."""
 
 
 @dataclass(frozen=True)
@@ -357,13 +355,13 @@ def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
     if incomplete := incomplete_lens(path, values.get("camera_lens", {})):
         return problems + incomplete
     try:
-        _calibration(values)
+        calibration = _calibration(values)
     except ValueError as error:
         problems.append(
             InputError(path, "image_calibration", error, "three points that span the plane")
         )
     else:
-        problems += _nearly_one_line(path, values["image_calibration"])
+        problems += view_problems(path, values, calibration)
     return problems
 
 
@@ -406,9 +404,9 @@ def _steep_lines(path: Path, pattern: dict[str, Any], angle: float) -> list[Inpu
 
 
 def _rays_beyond(path: Path, pattern: dict[str, Any]) -> list[InputError]:
-    """Find named rays that lie beyond the pattern's rows and columns."""
+    """Find named rays beyond the pattern's rows and columns, and a pattern without any ray."""
     rows, columns = pattern["rows"], pattern["columns"]
-    return [
+    problems = [
         InputError(
             path, f"pattern.{key}", [i, j], f"rays [row, column] from [1, 1] to [{rows}, {columns}]"
         )
@@ -416,26 +414,10 @@ def _rays_beyond(path: Path, pattern: dict[str, Any]) -> list[InputError]:
         for i, j, *_ in pattern.get(key, [])
         if not (1 <= i <= rows and 1 <= j <= columns)
     ]
-
-
-def _nearly_one_line(path: Path, keys: dict[str, Any]) -> list[InputError]:
-    """Find axes that are closer together in the picture than a camera can see them."""
-    if "homography" in keys:
-        return []
-    x_arm, z_arm = (
-        np.subtract(keys[f"{axis}_axis_px"], keys["origin_px"], dtype=float) for axis in "xz"
-    )
-    sine = (x_arm[0] * z_arm[1] - x_arm[1] * z_arm[0]) / np.hypot(*x_arm) / np.hypot(*z_arm)
-    if abs(sine) >= np.sin(np.radians(LEAST_ANGLE_DEG)):
-        return []
-    return [
-        InputError(
-            path,
-            "image_calibration",
-            "O′, x_axis_px and z_axis_px lie nearly on one line",
-            f"at least {LEAST_ANGLE_DEG:g} degrees between O′X′ and O′Z′ in the picture",
-        )
-    ]
+    if not problems and len(dot_pattern(pattern).absent_rays) == rows * columns:
+        expected = "at least one ray of the pattern that is there"
+        problems.append(InputError(path, "pattern.absent", "every ray", expected))
+    return problems
 
 
 def _rig(values: dict[str, Any], calibration: ImageCalibration) -> Rig:

@@ -193,6 +193,35 @@ def test_wrong_homography_is_rejected(path: Path, old: str, new: str) -> None:
         read_setup(change(path, old, new))
 
 
+@pytest.mark.parametrize("row", ["[0.0, -0.004, 1.0]]", "[0.01, 0.0, 1e-300]]"])
+def test_horizon_across_the_plane_is_rejected(path: Path, row: str) -> None:
+    path.write_text(HOMOGRAPHY)
+    with pytest.raises(InputError) as caught:
+        read_setup(change(path, "[0.0, 0.0, 1.0]]", row))
+    assert [each.field for each in caught.value.problems] == ["image_calibration.homography"]
+
+
+@pytest.mark.parametrize("k1", [-4.0, -5.0, -1e300])
+@pytest.mark.parametrize("points", [True, False])
+def test_distortion_that_cannot_be_undone_is_rejected(path: Path, k1: float, points: bool) -> None:
+    text = path.read_text() if points else HOMOGRAPHY
+    lens = "focal_px = [800, 800]\ncenter_px = [240, 320]\n"
+    path.write_text(f"{text}\n[camera_lens]\n{lens}distortion = [{k1}, 0, 0, 0, 0]\n")
+    with pytest.raises(InputError) as caught:
+        read_setup(path)
+    assert [each.field for each in caught.value.problems] == ["camera_lens.distortion"]
+    read_setup(change(path, f"[{k1},", "[-0.3,"))
+
+
+def test_pattern_without_rays_is_rejected(path: Path) -> None:
+    rays = [[i, j] for i in range(1, 20) for j in range(1, 20)]
+    change(path, "rows = 19\n", f"rows = 19\nabsent = {rays}\n")
+    with pytest.raises(InputError) as caught:
+        read_setup(path)
+    assert caught.value.field == "pattern.absent"
+    read_setup(change(path, "[1, 1], ", ""))
+
+
 def test_two_forms_of_calibration_are_rejected(path: Path) -> None:
     path.write_text(HOMOGRAPHY + "z_axis_mm = 31.75\n")
     with pytest.raises(InputError, match=r"image_calibration\.z_axis_mm: unknown key"):
