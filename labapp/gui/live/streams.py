@@ -118,8 +118,9 @@ class LiveStreams(QWidget):
             elif problem:
                 self._problems[kind] = problem
                 self.boxes[kind].setChecked(False)
-                self._workspace.notified.emit(f"{words}: {problem}", True)
+                self._workspace.say_wrong(words, f"{words}: {problem}")
             elif place:
+                self._workspace.settle(words)
                 self._workspace.notified.emit(f"{words}: measures are sent from {place}", False)
             self.show_state()
 

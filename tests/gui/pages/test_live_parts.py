@@ -506,6 +506,22 @@ def test_stream_with_a_fault_is_switched_off_and_says_why(
     qtbot.waitUntil(lambda: streams.words["lines"].text().startswith(f"● 127.0.0.1:{port}"))
 
 
+def test_problem_of_a_port_ends_when_the_stream_is_open(
+    window: MainWindow, page: CapturePage, qtbot: QtBot, port: int
+):
+    hand, streams = Hand(window), page.live_view.canvas.streams
+    start(page, qtbot)
+    choose(page, "Control software")
+    hand.enter(streams.ports["lines"], str(port))
+    with socket.create_server(("127.0.0.1", port)):
+        streams.boxes["lines"].click()
+        qtbot.waitUntil(lambda: any(str(port) in each for each in window.status_line.unread))
+    assert not streams.boxes["lines"].isChecked()
+    streams.boxes["lines"].click()
+    qtbot.waitUntil(lambda: streams.words["lines"].text().startswith(f"● 127.0.0.1:{port}"))
+    qtbot.waitUntil(lambda: window.status_line.unread == [])
+
+
 def test_control_software_receives_results_while_live(
     window: MainWindow, page: CapturePage, qtbot: QtBot, port: int
 ):
