@@ -73,17 +73,20 @@ def ask_setup(parent: QWidget, folder: Path) -> Path | None:
     return ask_file(parent, "Load set-up", folder, f"{SETUP_FILES};;{EVERYTHING}")
 
 
-def ask_read_only(parent: QWidget, path: Path) -> bool:
-    """Offer to open a session read-only because it is open in another program."""
+def ask_read_only(parent: QWidget, path: Path, in_use: bool = True) -> bool:
+    """Offer to open a session read-only because it is open elsewhere, or cannot be written."""
     box = QMessageBox(parent)
     box.setObjectName("read-only")
     box.setIcon(QMessageBox.Icon.Question)
-    box.setWindowTitle("The session is in use")
+    box.setWindowTitle("The session is in use" if in_use else "The session cannot be written")
     box.setTextFormat(Qt.TextFormat.PlainText)
-    box.setText(f"{path.name} is open in another window or program.")
+    why = "is open in another window or program" if in_use else "or its folder cannot be written"
+    until = (
+        "it is closed there" if in_use else "it is copied, with its recording, to another folder"
+    )
+    box.setText(f"{path.name} {why}.")
     box.setInformativeText(
-        "You can look at it read-only: nothing can be changed or measured in it until it is "
-        "closed there."
+        f"You can look at it read-only: nothing can be changed or measured in it until {until}."
     )
     look = box.addButton("Open &read-only", QMessageBox.ButtonRole.AcceptRole)
     look.setToolTip("Look at the session without changing it")

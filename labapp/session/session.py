@@ -97,8 +97,9 @@ class Session(SessionContents):
 
         Raises
         ------
-        SessionInUse
-            If another program has it open for writing; it can still be opened read-only.
+        OnlyReadable
+            If another program has it open for writing (`SessionInUse`), or the file or its folder
+            cannot be written; it can still be opened read-only.
         InputError
             If it cannot be read, is not a session, or is of a newer version of labapp.
         """

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+
+import pytest
 from PySide6.QtWidgets import QAbstractButton, QCheckBox, QComboBox, QLineEdit
 from pytestqt.qtbot import QtBot
 
+from labapp.gui import dialogs
 from labapp.gui.shell.steps import READ_ONLY, STEPS
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.fields import ChoiceField, Field, NumberField
+from labapp.session.file import database
 from labapp.session.session import Session
 from tests.gui.conftest import CopySample
 
@@ -47,6 +52,29 @@ def test_enabled_fields_accept_input(
         entered += len(usable)
         assert [words for words in messages if "read-only" in words] == []
     assert entered > 0  # values that only the page uses can still be entered
+
+
+def test_session_in_a_folder_that_cannot_be_written_is_offered_read_only(
+    window: MainWindow, copy_sample: CopySample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, asked = copy_sample("gtaw"), []
+
+    def fail(_: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    def ask(*given: object) -> bool:
+        asked.append(given)
+        return True
+
+    with monkeypatch.context() as patch:
+        patch.setattr(database, "acquire", fail)
+        patch.setattr(dialogs, "ask_read_only", ask)
+        assert window.files.open(path)
+    assert asked == [(window, path, False)]
+    session = window.workspace.session
+    assert session is not None
+    assert (session.path, session.read_only) == (path, True)
+    assert window.status_line.unread == []
 
 
 def test_locked_fields_give_a_reason_and_unlock_with_the_session(

@@ -12,7 +12,7 @@ import pytest
 
 from labapp.errors import InputError
 from labapp.session.file import database as module
-from labapp.session.file.database import Database, SessionInUse
+from labapp.session.file.database import Database, OnlyReadable, SessionInUse
 from labapp.session.file.schema import APPLICATION_ID, TABLES, VERSION
 from tests.scripts import run_python
 
@@ -162,6 +162,16 @@ def test_folder_without_files_is_not_taken_for_another_writer():
         Database.create("/proc/self/a.labsession")
     assert not isinstance(caught.value, SessionInUse)
     assert caught.value.field == "folder"
+
+
+def test_file_that_cannot_be_written_can_still_be_read(path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(os, "access", lambda *_: False)  # permissions do not bind root
+    with pytest.raises(OnlyReadable) as caught:
+        Database.open(path)
+    assert not isinstance(caught.value, SessionInUse)
+    database = Database.open(path, read_only=True)
+    assert kinds(database) == ["one"]
+    database.close()
 
 
 def test_second_writer_through_a_link_is_rejected(path: Path, tmp_path: Path):

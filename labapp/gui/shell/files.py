@@ -12,7 +12,7 @@ from PySide6.QtCore import QObject, QTimer, Signal
 from labapp.gui import dialogs
 from labapp.gui.drafts import folder_of, is_draft, new_draft
 from labapp.gui.workspace import MISSING
-from labapp.session.file.database import SUFFIX, SessionInUse
+from labapp.session.file.database import SUFFIX, OnlyReadable, SessionInUse
 
 if TYPE_CHECKING:
     from PySide6.QtWidgets import QWidget
@@ -257,8 +257,8 @@ class Files(QObject):
 
         try:
             return Session.open(path)
-        except SessionInUse:
-            if not dialogs.ask_read_only(self._window, path):
+        except OnlyReadable as error:
+            if not dialogs.ask_read_only(self._window, path, isinstance(error, SessionInUse)):
                 return None
             return Session.open(path, read_only=True)
 

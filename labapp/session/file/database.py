@@ -6,6 +6,7 @@ complete file, which can be copied, moved and stored on a network drive.
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import sqlite3
@@ -50,8 +51,12 @@ JOURNAL_MAGIC = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
 OWN_JOURNAL = "a journal written by labapp, or none: this one is from another program"
 
 
-class SessionInUse(InputError):
-    """Another program has the session open for writing; it can still be opened read-only."""
+class OnlyReadable(InputError):
+    """The session cannot be opened for writing; it can still be opened read-only."""
+
+
+class SessionInUse(OnlyReadable):
+    """Another program has the session open for writing."""
 
 
 class Database:
@@ -111,8 +116,9 @@ class Database:
 
         Raises
         ------
-        SessionInUse
-            If it is to be opened for writing, and another program has done so.
+        OnlyReadable
+            If it is to be opened for writing, and another program has done so (`SessionInUse`), or
+            the file or its folder cannot be written.
         InputError
             If it cannot be read, is not a session, or has a newer version.
         """
@@ -399,6 +405,8 @@ def _lock(path: Path) -> FileLock:
     try:
         if not path.parent.is_dir():
             raise NotADirectoryError(20, "does not exist")
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError(errno.EACCES, "the file cannot be written")
         acquire(lock)
     except Timeout as error:
         raise SessionInUse(
@@ -408,13 +416,11 @@ def _lock(path: Path) -> FileLock:
             "a session that no other program writes: close it there, or open it read-only",
         ) from error
     except (OSError, NotImplementedError) as error:
-        raise InputError(
-            path,
-            "folder",
-            getattr(error, "strerror", None) or error,
-            "a folder that can be written"
-            + ("; the session can be opened read-only" if path.exists() else ""),
-        ) from error
+        why = getattr(error, "strerror", None) or error
+        if not path.exists():
+            raise InputError(path, "folder", why, "a folder that can be written") from error
+        expected = "a file and a folder that can be written; the session can be opened read-only"
+        raise OnlyReadable(path, "session", why, expected) from error
     return lock
 
 
