@@ -11,7 +11,7 @@ import pytest
 from PySide6.QtCore import QEvent, QPoint, QPointF, Qt
 from PySide6.QtGui import QMouseEvent
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication, QHBoxLayout, QToolButton, QWidget
+from PySide6.QtWidgets import QAbstractButton, QApplication, QHBoxLayout, QToolButton, QWidget
 from pytestqt.qtbot import QtBot
 
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -141,6 +141,18 @@ def faulty_correction(session: Session, frame: int) -> tuple[Correction, np.ndar
 def truth(path: Path, frame: int) -> dict[str, float]:
     with (path.parent / "truth.csv").open() as file:
         return {name: float(value) for name, value in list(csv.DictReader(file))[frame].items()}
+
+
+def test_missing_recording_is_named_and_cannot_be_measured(
+    page: DotsPage, copy_sample: CopySample, qtbot: QtBot
+) -> None:
+    path = copy_sample("gtaw")
+    (path.parent / "recording.avi").unlink()
+    page.workspace.show(Session.open(path))
+    qtbot.waitUntil(lambda: "⚠ recording.avi is missing" in page.dots_panel.seen.text())
+    shown = page.measure_lead.currentWidget()
+    assert shown is not None
+    assert not any(each.isEnabled() for each in shown.findChildren(QAbstractButton))
 
 
 def test_frame_with_faults_is_corrected_in_15_actions(

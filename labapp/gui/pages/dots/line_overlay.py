@@ -113,7 +113,7 @@ class LinesPanel(QWidget):
     def show_frame(self, state: LinesState) -> None:
         """Show the session's data of the frame in view."""
         self.seen.setText(state.words)
-        show_words(self.why, f"⚠ {state.why[:1].upper()}{state.why[1:]}" if state.why else "")
+        show_words(self.why, f"⚠ {state.why}" if state.why else "")
         self.lines.show_lines(state.listed)
         self.rows.set_rows(state.rows)
 

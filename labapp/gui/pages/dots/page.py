@@ -208,7 +208,9 @@ class DotsPage(Page):
         session = self.workspace.session
         if session is not None:
             measuring = "Frames are being measured" if self.workspace.measuring is not None else ""
-            self.measure_lead.offer(bool(session.setup_problems), self.locked or measuring)
+            without_setup = bool(session.setup_problems)
+            gone = "" if without_setup else recording_gone(session)
+            self.measure_lead.offer(without_setup, self.locked or measuring or gone)
 
     def draw(self) -> None:
         """Draw the marks, including a drag in progress."""

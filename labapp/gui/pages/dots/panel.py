@@ -95,7 +95,7 @@ class DotsPanel(QWidget):
         self, seen: str, why: str, fit: Sequence[ResultRow], rows: Sequence[RowLine] | None
     ) -> None:
         """Show the session's data of the frame in view; None keeps the list of rows."""
-        self.seen.setText(f"{seen}\n⚠ {why[:1].upper()}{why[1:]}." if why else seen)
+        self.seen.setText(f"{seen}\n⚠ {why}." if why else seen)
         self.fit.set_rows(fit)
         if rows is not None:
             self.rows.show_lines(rows)
