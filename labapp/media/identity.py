@@ -34,6 +34,17 @@ def identify(path: Path) -> tuple[int, str]:
     return size, hashlib.sha256(repr(digests).encode()).hexdigest()
 
 
+def size_of(path: Path) -> int:
+    """Return the size of a recording in bytes, as `identify` does, without reading it.
+
+    Raises
+    ------
+    OSError
+        If a file is missing.
+    """
+    return sum(file.stat().st_size for file in _files(path))
+
+
 def stamp(path: Path) -> str:
     """Return a digest of names, sizes and modification times of a recording's files.
 

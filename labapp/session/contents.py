@@ -226,6 +226,11 @@ class SessionContents:
         return self._frames.missing
 
     @property
+    def replaced_recording(self) -> Path | None:
+        """Path of a file of another size in place of the recording; None if there is none."""
+        return self._frames.replaced
+
+    @property
     def frames(self) -> IntArray:
         """Numbers of the session's frames, ascending, shape (n,)."""
         return self._frames.numbers

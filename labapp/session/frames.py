@@ -10,6 +10,7 @@ import hashlib
 import os
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from labapp.export.summary import format_ranges
 from labapp.files import relative_path
 from labapp.media import Frame, FrameSource, GreyImage, open_source
 from labapp.media.formats.images import decoded
-from labapp.media.identity import identify
+from labapp.media.identity import identify, size_of
 from labapp.media.survey import Survey, frame_checksum, survey
 from labapp.run.runner import select_frames
 from labapp.session.file.blobs import MAGIC, pack, unpack_from
@@ -275,6 +276,19 @@ class Frames:
         if recording is None or recording.embedded or self._place().exists():
             return None
         return self._place()
+
+    @property
+    def replaced(self) -> Path | None:
+        """Path at which there is a file of another size than the imported one; None if not.
+
+        Folders are not looked through. Frames are compared with the imported ones when read.
+        """
+        recording = self.recording
+        if recording is None or recording.embedded or not self._place().is_file():
+            return None
+        with suppress(OSError):
+            return self._place() if size_of(self._place()) != recording.size else None
+        return None
 
     def refuse_missing(self) -> None:
         """Raise if the recording is missing.

@@ -592,6 +592,13 @@ def test_missing_recording_is_reported_on_opening(plain: MainWindow, copy_sample
     assert "recording.avi" in problems(plain)[0]
 
 
+def test_replaced_recording_is_reported_on_opening(plain: MainWindow, copy_sample: CopySample):
+    path = copy_sample("gtaw")
+    (path.parent / "recording.avi").write_bytes(b"another")
+    assert plain.files.open(path)
+    assert "recording.avi" in problems(plain)[0]
+
+
 def test_copying_a_picture_and_a_table(plain: MainWindow, copy_sample: CopySample):
     from PySide6.QtWidgets import QTableWidget, QTableWidgetItem
 

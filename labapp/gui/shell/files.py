@@ -270,6 +270,9 @@ class Files(QObject):
         if missing is not None:
             words = f"The recording is missing: {missing}"
             self.workspace.say_wrong(MISSING, words)
+        replaced = self.workspace.run_or_report(lambda: session.replaced_recording)
+        if replaced is not None:
+            self.workspace.say_wrong(MISSING, f"Not the imported recording: {replaced}")
 
 
 def title(session: Session | None) -> str:

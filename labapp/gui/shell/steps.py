@@ -224,6 +224,8 @@ def _capture(facts: Facts) -> State:
     if facts.session.recording is None:
         return State(Mark.READY, "No recording yet")
     gone = recording_gone(facts.session)
+    if (replaced := facts.session.replaced_recording) is not None:
+        gone = f"{replaced.name} is not the imported recording: locate that (step Recording)"
     return (
         State(Mark.ATTENTION, gone) if gone else State(Mark.DONE, pluralize(facts.count, "frame"))
     )

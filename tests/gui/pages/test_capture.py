@@ -30,7 +30,7 @@ from labapp.gui.pages.capture.presenter import (
     recording_facts,
     refusal,
 )
-from labapp.gui.shell.steps import Mark, State
+from labapp.gui.shell.steps import Mark, State, states
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.exposure import BARS, bars
 from labapp.gui.workspace import Workspace
@@ -135,6 +135,27 @@ def test_exposure_of_dots_is_hidden_once_lines_are_open(copy_sample, qtbot: QtBo
     page._judge()
     qtbot.waitUntil(lambda: not workspace.tasks.active)
     assert page.exposure.isHidden()
+    workspace.close()
+
+
+def test_recording_replaced_by_another_can_be_located(
+    copy_sample, tmp_path: Path, qtbot: QtBot
+) -> None:
+    path = copy_sample("gtaw")
+    place = path.parent / "recording.avi"
+    kept = place.rename(tmp_path / "kept.avi")
+    place.write_bytes(b"another")
+    workspace = Workspace()
+    workspace.show(Session.open(path))
+    page = make_page(workspace)
+    session = session_of(page)
+    assert session.missing_recording is None
+    assert states(session)["capture"].mark is Mark.ATTENTION
+    assert page.find_button.isVisibleTo(page.panel)
+    page.relink(kept)
+    qtbot.waitUntil(lambda: states(session)["capture"].mark is Mark.DONE)
+    page.refresh()
+    assert not page.find_button.isVisibleTo(page.panel)
     workspace.close()
 
 

@@ -400,8 +400,8 @@ class CapturePage(Page):
         self.workspace.changed.emit()
 
     def find_recording(self) -> None:
-        """Ask for the new location of a missing recording."""
-        missing = self.session.missing_recording
+        """Ask for the new location of a recording that is missing or replaced."""
+        missing = self.session.missing_recording or self.session.replaced_recording
         if missing is None:
             return
         # A folder of images has no suffix and needs another dialog than a file.

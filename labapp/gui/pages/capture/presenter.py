@@ -171,14 +171,21 @@ def recording_facts(recording: Recording) -> tuple[tuple[str, str], ...]:
 
 
 def missing_text(session: Session) -> str:
-    """Message if the recording is missing, with the consequences; empty if it is not."""
-    missing = session.missing_recording
-    if missing is None:
+    """Message if the recording is missing or replaced, with the consequences; empty if not."""
+    missing, replaced = session.missing_recording, session.replaced_recording
+    if missing is not None:
+        lost = (
+            f"{missing.name} is missing in {missing.parent}. What was measured is still there, "
+            "but no frame can be seen or measured. "
+        )
+    elif replaced is not None:
+        lost = (
+            f"{replaced.name} in {replaced.parent} is not the recording that was imported: its "
+            "size is another one. What was measured is still there, but frames that are not those "
+            "imported cannot be seen or measured. "
+        )
+    else:
         return ""
-    lost = (
-        f"{missing.name} is missing in {missing.parent}. What was measured is still there, "
-        "but no frame can be seen or measured. "
-    )
     if session.read_only:
         return f"{lost}The session is open read-only: open it for changes to locate it."
     return f"{lost}Locate it: only the same recording is accepted, by its size and SHA-256."
