@@ -165,6 +165,13 @@ def test_readout_describes_the_point_at_the_pointer(view: PlotStack) -> None:
     assert "○ in doubt" in view.legend.text()
 
 
+@pytest.mark.parametrize("mark", [0, 1])
+def test_legend_is_shown_unless_all_points_are_usual(view: PlotStack, mark: int) -> None:
+    one = replace(curve(), mark=np.full(10, mark))
+    view.show_curves([one], TIME)
+    assert view.legend.isVisibleTo(view) == bool(mark)
+
+
 def test_zoom_is_kept_for_new_values_and_reset_for_new_curves(view: PlotStack) -> None:
     QTest.keyClick(view, Qt.Key.Key_Plus)
     zoomed = view._plots[0].viewRange()[0]

@@ -178,7 +178,8 @@ class PlotStack(Plotted):
         words = [f"{m.sign} {m.words}" for m in marks if m.words]
         has_events = any(len(curve.events) for curve in self.curves)
         self.legend.setText("    ".join(words + ["┊ change"] * has_events))
-        self.legend.setVisible(len(marks) > 1 or has_events)
+        is_usual = not any(curve.mark.any() for curve in self.curves)  # the first mark only
+        self.legend.setVisible(len(marks) > 1 or has_events or not is_usual)
 
     def _show_read_out(self, words: str) -> None:
         self.read_out.setText(words or " ")
