@@ -112,6 +112,7 @@ def test_outdated_frame_can_be_measured_again(page: SurfacePage, qtbot: QtBot) -
     assert page.side.again.isHidden()
     page.side.correspondence.edited.emit("S/S")
     assert page.side.status.text().startswith("⟳ These figures are out of date")
+    assert page.view.scene.stamp == "out of date"
     assert not page.side.again.isHidden()
     page.side.again.click()
     assert not page.side.one.isEnabled()

@@ -357,10 +357,10 @@ class SurfacePage(Page):
         if reconstruction is not None and self.options.section is not None:
             cut = profile(reconstruction, *self.options.section)
         if result is not None and seen is not None:
-            measurement = result.measurement
+            rig, stale = result.parsed_setup.rig, bool(result.stale)
             limits = height_limits(seen) if self.options.same_colours else None
-            drawn = scene(measurement, result.parsed_setup.rig, self.options, limits, cut)
-            dots = reflected_dots(measurement)
+            drawn = scene(result.measurement, rig, self.options, limits, cut, stale)
+            dots = reflected_dots(result.measurement)
         self.view.set_words(self.surface_state.words)
         self.view.sigma_at = None if reconstruction is None else partial(_sigma, reconstruction)
         self.view.show_scene(drawn)

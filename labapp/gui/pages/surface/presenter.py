@@ -298,6 +298,7 @@ def scene(
     options: Options,
     limits: tuple[float, float] | None,
     cut: Profile | None,
+    stale: bool = False,
 ) -> Scene | None:
     """Scene of a measurement for the 3-D view; None without a surface.
 
@@ -307,6 +308,8 @@ def scene(
         Colour scale that all frames share, mm; None: that of this frame.
     cut
         Section to mark on the surface; None for none.
+    stale
+        Whether the measurement is out of date, which saved pictures say, too.
     """
     reconstruction, match = pool_of(measurement), measurement.match
     if reconstruction is None:
@@ -324,6 +327,7 @@ def scene(
         contours=options.contours,
         plate_mm=made.plate_mm if options.work_piece else made.plate_mm[:0],
         exaggeration=options.exaggeration,
+        stamp="out of date" if stale else "",
     )
 
 
