@@ -381,6 +381,30 @@ def test_ctrl_c_while_the_commands_are_loaded_stops_the_program() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
+INTERRUPTED_AT_THE_END = """
+import os, runpy, signal, sys
+
+class Last:
+    def __del__(self, kill=os.kill, own=os.getpid(), number=signal.SIGINT):
+        kill(own, number)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.last = Last()  # deleted when Python frees its modules
+sys.argv = ["labapp", "--version"]
+runpy.run_module("labapp", run_name="__main__")
+"""
+
+
+def test_ctrl_c_when_all_is_done_changes_nothing() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_AT_THE_END],
+        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("labapp ")
+
+
 @pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_stopped_run_leaves_complete_frames(
     tmp_path: Path, signal_number: signal.Signals, code: int
