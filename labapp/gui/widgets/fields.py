@@ -307,6 +307,11 @@ class TextField(Field):
             if isinstance(self._edit, QLineEdit) and not self._edit.hasFocus():
                 self._edit.setCursorPosition(0)  # of a long text, its beginning is in view
 
+    def keep_unstored(self, stored: str) -> None:
+        """Keep a text that could not be stored, and say so; leaving the field enters it again."""
+        self._emitted = stored
+        self.refuse("Not stored: leave the field to try again")
+
     def flush(self) -> None:
         """Finish a current edit, as leaving the field does."""
         self._enter(self.value())

@@ -372,6 +372,27 @@ def test_fields_are_below_the_drawing_on_a_small_canvas(qtbot: QtBot, page: Setu
     assert all(box.parent() is box.plot and box.isVisible() for box in bench.boxes.values())
 
 
+def test_text_that_cannot_be_stored_stays_marked_and_is_tried_again(
+    qtbot: QtBot, page: SetupPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, field = page.workspace.session, page.record_fields["operator"]
+    assert session is not None
+
+    def full(*_: object) -> None:
+        raise InputError("run.labsession", "disk", "no space left", "room on the disk")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, "set_record", full)
+        retype(qtbot, field, "Ada")
+        page.refresh()
+    assert field.value() == "Ada"
+    assert field.problem.text()
+    assert session.record.operator != "Ada"
+    field.flush()
+    assert session.record.operator == "Ada"
+    assert field.problem.text() == ""
+
+
 def test_record_and_checklist_are_edited_by_hand(qtbot: QtBot, page: SetupPage) -> None:
     session = page.workspace.session
     assert session is not None

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from PySide6.QtWidgets import QCheckBox, QLabel, QTabWidget, QVBoxLayout, QWidget
 
@@ -183,11 +185,15 @@ class SetupPage(Page):
         else:
             lines = 4 if entry.key == "notes" else 1
             field = TextField(entry.label, tooltip=entry.tooltip, lines=lines)
-        self.change_when_edited(
-            field, lambda session, value: presenter.note(session, entry.key, value)
-        )
+        field.edited.connect(partial(self._note, field, entry.key))
         self.record_fields[entry.key] = field
         form.add(field)
+
+    def _note(self, field: NumberField | TextField, key: str, value: Any) -> None:
+        stored = self.workspace.attempt(lambda session: presenter.note(session, key, value))
+        session = self.workspace.session
+        if not stored and session is not None and isinstance(field, TextField):
+            field.keep_unstored(getattr(session.record, key))
 
     def _list(self, boxes: dict[str, QCheckBox], items: Items) -> QWidget:
         page = QWidget()
