@@ -1,13 +1,14 @@
 """Rendered frames of pools of every kind on benches of every kind.
 
-Run as ``python tests/benchmarks/benches.py [--pools N] [--seed S] [KIND …]``. Pools are those of
-``clutter.py``. Each frame has its own bench: laser (angle, distance, aim), pattern (9 to 25 rows,
-0.3 to 0.5 mm apart on the work piece), pose of the imaging plane, direction of travel, and camera
-(size of the picture, view upright, mirrored, rolled or oblique), with the default uncertainties of
-a setup file, and a look as in ``rendered.py``. At least `FEWEST` dots are in the picture. Prints a
-line for each frame with wrong labels, or with a size off by more than 4 of its σ; then, for every
-kind, how many were measured, and the root mean square of error over σ of each size. Fails if any
-frame was measured wrong.
+Run as ``python tests/benchmarks/benches.py [--pools N] [--seed S] [--off TIMES] [--refused]
+[KIND …]``. Pools are those of ``clutter.py``. Each frame has its own bench: laser (angle, distance,
+aim), pattern (9 to 25 rows, 0.3 to 0.5 mm apart on the work piece), pose of the imaging plane,
+direction of travel, and camera (size of the picture, view upright, mirrored, rolled or oblique).
+The setup has the default uncertainties of a setup file, and TIMES the errors of ``clutter.py``. The
+look is that of ``rendered.py``. At least `FEWEST` dots are in the picture. Prints a line for each
+frame with wrong labels, or with a size off by more than 4 of its σ; then, for every kind, how many
+were measured, and the root mean square of error over σ of each size. Fails if any frame was
+measured wrong.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.pools import Pool
 from labapp.simulation.render import GreyImage, RenderedFrame, render
-from tests.benchmarks.clutter import KINDS, as_entered
+from tests.benchmarks.clutter import KINDS, as_entered, displaced
 from tests.benchmarks.dips import height_error
 from tests.benchmarks.rendered import ON_ITS_DOT_PX, PX_PER_MM, draw_look
 
@@ -109,8 +110,8 @@ def draw_view(rays: Reflections, rng: np.random.Generator) -> CameraView:
     return CameraView(tuple(origin), tuple(x_axis), 60.0, tuple(z_axis), 60.0, width, height)
 
 
-def draw_scene(kind: str, seed: int) -> Scene:
-    """Draw benches and pools until enough dots are in the picture."""
+def draw_scene(kind: str, seed: int, off: float = 0.0) -> Scene:
+    """Draw benches and pools until enough dots are in the picture; enter the bench with errors."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind), 7])
     while True:
         rig = draw_rig(rng)
@@ -126,7 +127,8 @@ def draw_scene(kind: str, seed: int) -> Scene:
         axes = (view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm)
         calibration = ImageCalibration.from_three_points(*axes)
         scale = float(np.linalg.norm(view.px_per_mm[:, 0]))
-        return Scene(frame, Bench(as_entered(rig, calibration), calibration), scale, pool)
+        entered = as_entered(displaced(rig, rng, off), calibration)
+        return Scene(frame, Bench(entered, calibration), scale, pool)
 
 
 def measured(scene: Scene) -> SceneResult:
@@ -155,13 +157,14 @@ def main() -> int:
     parser.add_argument("kinds", nargs="*", default=list(KINDS))
     parser.add_argument("--pools", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--off", type=float, default=0.0)
     parser.add_argument("--refused", action="store_true", help="print a line for these as well")
     chosen = parser.parse_args()
     wrong = 0
     for kind in chosen.kinds:
         results = []
         for seed in range(chosen.seed, chosen.seed + chosen.pools):
-            results.append(one := measured(draw_scene(kind, seed)))
+            results.append(one := measured(draw_scene(kind, seed, chosen.off)))
             if one.is_wrong or (chosen.refused and one.status != "ok"):
                 print(f"{kind} {seed}: {one}", flush=True)
         wrong += sum(one.is_wrong for one in results)

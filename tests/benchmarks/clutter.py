@@ -103,15 +103,22 @@ def draw(kind: str, seed: int, missing: float, false: int) -> tuple[Rig, SeenDot
 
 def with_setup_errors(rig: Rig, seed: int, times: float) -> Rig:
     """Return the rig with random setup errors, and the default uncertainties."""
-    rng = np.random.default_rng([seed, 78])
+    return as_entered(displaced(rig, np.random.default_rng([seed, 78]), times), BENCH_VIEW)
+
+
+def displaced(rig: Rig, rng: np.random.Generator, times: float) -> Rig:
+    """Return the rig with random errors of the laser and the imaging plane."""
     angle, distance = times * rng.normal(0.0, [0.2, 0.3])
     laser, plane = rig.laser, rig.imaging_plane
-    wrong = replace(
+    return replace(
         rig,
-        laser=Laser(laser.projection_angle_deg + angle, laser.distance_mm + distance),
+        laser=replace(
+            laser,
+            projection_angle_deg=laser.projection_angle_deg + angle,
+            distance_mm=laser.distance_mm + distance,
+        ),
         imaging_plane=replace(plane, origin_mm=plane.origin_mm + times * rng.normal(0, 0.3, 3)),
     )
-    return as_entered(wrong, BENCH_VIEW)
 
 
 def as_entered(rig: Rig, calibration: ImageCalibration) -> Rig:
