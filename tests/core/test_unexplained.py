@@ -114,7 +114,7 @@ def test_dots_between_labelled_rows_are_a_row() -> None:
     row = np.flatnonzero((labels != UNLABELLED).any(axis=1))[2]
     labels[row:-1], labels[-1] = labels[row + 1 :], UNLABELLED
     observed, found = hypothesis(seen, labels)
-    assert unexplained._strays_in_line(observed, found) >= unexplained.ROW
+    assert unexplained._strays_in_line(observed, found.labels, found.stray_dots) >= unexplained.ROW
 
 
 def test_dots_beside_and_between_the_same_labels_are_a_row() -> None:
@@ -125,7 +125,11 @@ def test_dots_beside_and_between_the_same_labels_are_a_row() -> None:
     dots = np.sum(labels[second] != UNLABELLED)
     labels[second], labels[first] = labels[first], UNLABELLED
     observed, found = hypothesis(seen, labels)
-    assert found.stray_count == unexplained._strays_in_line(observed, found) == dots
+    assert (
+        found.stray_count
+        == unexplained._strays_in_line(observed, found.labels, found.stray_dots)
+        == dots
+    )
     assert not suffices(observed, found)
 
 

@@ -201,6 +201,33 @@ def test_missing_and_false_dots_get_no_ray() -> None:
     assert len(rays) >= frame.shown.sum() - 6
 
 
+def places_apart(frame: RecordedFrame, count: int) -> FloatArray:
+    """Random places in the picture that are away from its dots, shape (count, 2), px."""
+    places = np.random.default_rng(5).uniform((20.0, 20.0), (460.0, 620.0), (200, 2))
+    from_dots = places[:, None] - frame.dot_px[frame.shown]
+    return places[np.linalg.norm(from_dots, axis=-1).min(axis=1) > 15.0][:count]
+
+
+def test_frame_with_isolated_false_dots_is_followed() -> None:
+    """Once such a frame lost the track and took twenty times as long, with the same result."""
+    frame, follower = frames()[WARMED], chain()
+    result = follower.measure(with_dots(frame.image, places_apart(frame, 10)))
+    assert follower.track_lost is None
+    assert wrong_rays(result, frame) == 0
+    assert result.match is not None
+    assert len(result.match.ray) >= 0.97 * frame.shown.sum()
+
+
+def test_row_of_dots_without_rays_breaks_the_track() -> None:
+    frame, follower = frames()[WARMED], chain()
+    last = np.flatnonzero(frame.shown.any(axis=1))[-1]
+    columns = frame.shown[last]
+    beyond = 2 * frame.dot_px[last, columns] - frame.dot_px[last - 1, columns]
+    assert len(beyond) >= 4
+    follower.measure(with_dots(frame.image, np.vstack([beyond, places_apart(frame, 5)])))
+    assert follower.track_lost is not None
+
+
 @pytest.mark.parametrize("beside", [(5.0, 0.0), (0.0, 5.0)])
 def test_dot_merged_with_a_false_one_gets_no_ray(
     beside: tuple[float, float],

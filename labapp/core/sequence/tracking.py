@@ -18,7 +18,7 @@ import numpy as np
 
 from labapp.core.images import band_pass_kernels
 from labapp.core.match import Trial, missing_share
-from labapp.core.matching.checks.unexplained import refuse_contradicted
+from labapp.core.matching.checks.unexplained import is_scattered, refuse_contradicted
 from labapp.core.matching.checks.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.label_growth import OUTLIER_SPACINGS, OUTLIER_TIMES
 from labapp.core.matching.match_rays import match_of_pairs
@@ -124,8 +124,8 @@ def track(
         fit = fit.without_dots(wrong)
     else:
         raise TrackLost("too many dots do not fit one surface")
-    rays, dots = fit.lit_rays, fit.labels.ravel()[fit.lit_rays]
-    _check_explained(classes, limits, len(observed.plane_mm), len(rays))
+    dots = fit.labels.ravel()[fit.lit_rays]
+    _check_explained(observed, fit.labels, classes, limits)
     pool = fitted_pool(fit.rounds, level, observed.rig, observed.plane_mm[dots])
     if not pool.residual_rms_mm < WORSE * prior.cold_residual_mm:
         raise TrackLost("the surface no longer explains the dots")
@@ -415,12 +415,20 @@ def _with_level(
     return RayClasses(ray_states, found.missed, found.stray), known_rays, level
 
 
-def _check_explained(classes: RayClasses, limits: MatchSettings, dots: int, rays: int) -> None:
+def _check_explained(
+    observed: Observation, labels: IntArray, classes: RayClasses, limits: MatchSettings
+) -> None:
+    """Raise `TrackLost` if more is left unexplained than is accepted without a prior."""
     stray, missed = len(classes.stray), len(classes.missed)
-    if stray > limits.most_strays(dots):
+    many_strays = stray > limits.most_strays(len(observed.plane_mm))
+    if not many_strays and missed <= limits.most_missed(count_labels(labels)):
+        return
+    missed_rays = np.stack(np.divmod(classes.missed, labels.shape[1]), axis=-1)
+    if is_scattered(observed, labels, missed_rays, classes.stray):
+        return
+    if many_strays:
         raise TrackLost(f"{stray} dots have no ray")
-    if missed > limits.most_missed(rays):
-        raise TrackLost(f"{missed} rays between the others have no dot")
+    raise TrackLost(f"{missed} rays between the others have no dot")
 
 
 def _reference_is_seen(observed: Observation, paths: RayPaths, off: float) -> bool:

@@ -8,10 +8,10 @@ import numpy as np
 from labapp.core.matching.free_setup import SETUP_GAIN, with_setup_free
 from labapp.core.matching.hypothesis import KNOT_ERROR_MM, USUAL_FIT, Hypothesis
 from labapp.core.matching.match_settings import MatchSettings
-from labapp.core.matching.observation import UNLABELLED, Observation
+from labapp.core.matching.observation import UNLABELLED, Observation, count_labels
 from labapp.core.surface.level import KnownRays
 from labapp.core.surface.pool_fit import FittedPool
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
 FEW_LEFT = 0.05
 """A hypothesis explains a frame if at most this share of the dots is stray, and as few rays are
@@ -71,7 +71,8 @@ explains a frame."""
 def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
     """Whether there are few stray dots, few and isolated missed rays, and no dot at the marker."""
     few = max(2, FEW_LEFT * len(observed.plane_mm))
-    most = MOST_MISSED_APART * hypothesis.label_count if _missed_lie_apart(hypothesis) else 0.0
+    apart = _missed_lie_apart(hypothesis.labels, hypothesis.missed_rays)
+    most = MOST_MISSED_APART * hypothesis.label_count if apart else 0.0
     missed = hypothesis.missed_count <= max(few, most)
     return hypothesis.stray_count <= few and missed and hypothesis.marker != "lit"
 
@@ -84,7 +85,7 @@ def suffices(observed: Observation, hypothesis: Hypothesis) -> bool:
     return explains(observed, hypothesis) or (
         hypothesis.residual_rms_mm < KNOT_ERROR_MM
         and _leaves_isolated(hypothesis, FEW_SCATTERED)
-        and _strays_in_line(observed, hypothesis) <= PAIR
+        and _strays_in_line(observed, hypothesis.labels, hypothesis.stray_dots) <= PAIR
     )
 
 
@@ -108,7 +109,7 @@ def refuse_unexplained(
     """
     few = best.stray_count <= settings.most_strays(best.label_count + best.stray_count)
     scattered = _leaves_isolated(best, most_scattered) and (
-        few or _strays_in_line(observed, best) < ROW
+        few or _strays_in_line(observed, best.labels, best.stray_dots) < ROW
     )
     if not explains_half(observed, best):
         raise CannotMeasure("no-match", NOTHING_EXPLAINS)
@@ -121,6 +122,21 @@ def refuse_unexplained(
         )
     if best.pool.level.ray_count and best.pool.level.disagreement_bits > CONTRADICTED_BITS:
         raise CannotMeasure("no-match", NO_BOUNDARY)
+
+
+def is_scattered(
+    observed: Observation, labels: IntArray, missed_rays: IntArray, stray_dots: IntArray
+) -> bool:
+    """Whether strays and missed rays are isolated, and at most `MOST_SCATTERED` of the labels.
+
+    Parameters are those of `Hypothesis`; its marker must be empty.
+    """
+    few = len(stray_dots) + len(missed_rays) <= MOST_SCATTERED * count_labels(labels)
+    return (
+        few
+        and _missed_lie_apart(labels, missed_rays)
+        and _strays_in_line(observed, labels, stray_dots) < ROW
+    )
 
 
 def refuse_contradicted(rays: KnownRays, pool: FittedPool) -> None:
@@ -171,29 +187,30 @@ def _leaves_isolated(hypothesis: Hypothesis, most: float) -> bool:
     """
     left = hypothesis.stray_count + hypothesis.missed_count
     few = left <= most * hypothesis.label_count
-    return few and hypothesis.marker == "empty" and _missed_lie_apart(hypothesis)
+    apart = _missed_lie_apart(hypothesis.labels, hypothesis.missed_rays)
+    return few and hypothesis.marker == "empty" and apart
 
 
-def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
+def _missed_lie_apart(labels: IntArray, missed_rays: IntArray) -> bool:
     """Whether at most `PAIR` missed rays are connected, or one more around a corner."""
-    seen = np.zeros(hypothesis.labels.shape, np.uint8)
-    seen[tuple(hypothesis.missed_rays.T)] = 1
+    seen = np.zeros(labels.shape, np.uint8)
+    seen[tuple(missed_rays.T)] = 1
     found = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:]
     count, sides = found[:, cv2.CC_STAT_AREA], found[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
     return bool((count <= PAIR + (sides == PAIR).all(axis=1)).all())
 
 
-def _strays_in_line(observed: Observation, hypothesis: Hypothesis) -> int:
+def _strays_in_line(observed: Observation, labels: IntArray, stray_dots: IntArray) -> int:
     """Largest number of stray dots side by side that continue the labelled rows and columns.
 
     An omitted row lies where the labelled dots beside it lead, by equal steps or by steps that
     change equally; a skipped one lies half-way between two labelled dots. False dots elsewhere are
     not taken for a row, however many there are.
     """
-    labelled = hypothesis.labels != UNLABELLED
+    labelled = labels != UNLABELLED
     place = np.full((*np.add(labelled.shape, 6), 2), np.nan)
-    place[3:-3, 3:-3][labelled] = observed.plane_mm[hypothesis.labels[labelled]]
-    stray = observed.plane_mm[hypothesis.stray_dots]
+    place[3:-3, 3:-3][labelled] = observed.plane_mm[labels[labelled]]
+    stray = observed.plane_mm[stray_dots]
     return max(_most_in_line(along, stray) for along in (place, place.swapaxes(0, 1)))
 
 
