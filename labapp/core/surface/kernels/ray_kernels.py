@@ -80,14 +80,20 @@ def _through_glass(
 
 
 @_inner
+def _reflected(ray: FloatArray, slope_x: float, slope_y: float) -> tuple[float, float, float]:
+    """Direction of a ray after its reflection where the surface has given slopes (Eq. 4-4)."""
+    # Twice the ray's part along the normal (−f_x, −f_y, 1) is taken off.
+    twice = 2.0 * (ray[2] - slope_x * ray[0] - slope_y * ray[1])
+    twice /= slope_x * slope_x + slope_y * slope_y + 1.0
+    return ray[0] + twice * slope_x, ray[1] + twice * slope_y, ray[2] - twice
+
+
+@_inner
 def reflected_dot(
     ray: FloatArray, point: FloatArray, slope_x: float, slope_y: float, plane: FloatArray
 ) -> tuple[float, float]:
     """Dot (X′, Z′) of a ray reflected at a point of given slopes; NaN if there is none."""
-    # Twice the ray's part along the normal (−f_x, −f_y, 1) is taken off (Eq. 4-4).
-    twice = 2.0 * (ray[2] - slope_x * ray[0] - slope_y * ray[1])
-    twice /= slope_x * slope_x + slope_y * slope_y + 1.0
-    away = ray[0] + twice * slope_x, ray[1] + twice * slope_y, ray[2] - twice
+    away = _reflected(ray, slope_x, slope_y)
     gap, along = 0.0, 0.0
     for axis in range(3):
         gap += (plane[0, axis] - point[axis]) * plane[3, axis]
@@ -279,11 +285,9 @@ def behind_torch(points: FloatArray, rays: FloatArray, slopes: FloatArray, tip: 
     """
     hidden = np.empty(len(rays), np.bool_)
     for k in range(len(rays)):
-        x, y, z = -rays[k, 0], -rays[k, 1], -rays[k, 2]
-        if points[k, 1] >= 0.0:  # Eq. 4-4
-            a, b = slopes[k, 0], slopes[k, 1]
-            twice = 2.0 * (a * x + b * y - z) / (a * a + b * b + 1.0)
-            y, z = twice * b - y, -twice - z
+        y, z = -rays[k, 1], -rays[k, 2]
+        if points[k, 1] >= 0.0:
+            _, y, z = _reflected(rays[k], slopes[k, 0], slopes[k, 1])
         y = y if y != 0.0 else 1e-12
         # Both ways lead towards y = 0 and up.
         hidden[k] = points[k, 2] - points[k, 1] * z / y > tip - TIP_MARGIN_MM
@@ -302,9 +306,7 @@ def _meet_again(
     (grid, coefficients), work = surface, np.empty((4, 4))
     met = np.zeros(len(rays), np.bool_)
     for k in range(len(rays)):
-        a, b = slopes[k, 0], slopes[k, 1]
-        twice = 2.0 * (rays[k, 2] - a * rays[k, 0] - b * rays[k, 1]) / (a * a + b * b + 1.0)
-        x, y, z = rays[k, 0] + twice * a, rays[k, 1] + twice * b, rays[k, 2] - twice
+        x, y, z = _reflected(rays[k], slopes[k, 0], slopes[k, 1])
         step = AGAIN_STEP_MM / np.hypot(x, y)
         at_x, at_y, at_z = points[k, 0], points[k, 1], points[k, 2]
         while at_z < rim and not met[k]:
