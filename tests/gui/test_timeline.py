@@ -39,7 +39,7 @@ def test_frame_status():
         [False, False, False, True, False, False, False],
     )
     assert [FrameStatus(kind).name for kind in frame_statuses(results)] == [
-        "NOT_MEASURED", "MEASURED", "CORRECTED", "DOUBTFUL", "NOT_MEASURABLE", "CORRECTED",
+        "NOT_MEASURED", "MEASURED", "CORRECTED", "OUT_OF_DATE", "NOT_MEASURABLE", "CORRECTED",
         "NOT_MEASURABLE",
     ]  # fmt: skip
 
@@ -51,6 +51,13 @@ def test_outlying_frame_is_doubtful():
     measures = dict.fromkeys(MEASURES, np.full(40, 1.0)) | {"width_mm": width}
     results = Overview(np.arange(40), np.arange(40) / 60, ("ok",) * 40, none, none, measures)
     assert np.flatnonzero(frame_statuses(results) == FrameStatus.DOUBTFUL).tolist() == [17]
+
+
+def test_results_that_are_out_of_date_are_counted_as_such(qtbot: QtBot):
+    kinds = frame_statuses(overview(["ok"] * 30, [False] * 30, [True] * 30))
+    timeline = shown(qtbot, kinds, width=1300)
+    assert "30&nbsp;out&nbsp;of&nbsp;date" in timeline.counts.text()
+    assert "in doubt" not in timeline.counts.toolTip()
 
 
 def test_next_frame():

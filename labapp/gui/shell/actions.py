@@ -207,7 +207,7 @@ FRAMES = (
         "next_doubtful",
         "Next frame in &doubt",
         "F8",
-        "Go to the next frame that could not be measured, stands out, or was changed since",
+        "Go to the next frame that could not be measured, stands out, or is out of date",
         needs="frames",
         begins=True,
     ),
@@ -215,7 +215,8 @@ FRAMES = (
         "previous_doubtful",
         "Previous frame in d&oubt",
         "Shift+F8",
-        "Go to the last frame before this one that stands out, or could not be measured",
+        "Go to the last frame before this one that could not be measured, stands out, or is out of "
+        "date",
         needs="frames",
     ),
     Action(

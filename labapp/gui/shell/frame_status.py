@@ -22,8 +22,9 @@ class FrameStatus(IntEnum):
     PULSE = 1
     MEASURED = 2
     CORRECTED = 3
-    DOUBTFUL = 4
-    NOT_MEASURABLE = 5
+    OUT_OF_DATE = 4
+    DOUBTFUL = 5
+    NOT_MEASURABLE = 6
 
 
 TICKS = (
@@ -32,14 +33,15 @@ TICKS = (
     Tick("measured", "done", "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
     Tick("corrected by hand", "by hand", "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
     Tick(
-        "in doubt: stands out, or changed since it was measured",
-        *("doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
+        "out of date: set-up, settings or dots changed since it was measured",
+        *("out of date", "#8a5a2e", "#c79a6b", ((0.0, 0.16), (0.24, 0.4), (0.48, 0.62))),
     ),
+    Tick("in doubt: stands out", "doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
     Tick("could not be measured", "failed", "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))),
 )
 """Ticks by `FrameStatus`, with the texts for the operator."""
 
-TO_CHECK = (FrameStatus.DOUBTFUL, FrameStatus.NOT_MEASURABLE)
+TO_CHECK = (FrameStatus.OUT_OF_DATE, FrameStatus.DOUBTFUL, FrameStatus.NOT_MEASURABLE)
 """States that the operator has to check."""
 
 
@@ -55,8 +57,8 @@ def frame_statuses(seen: Overview) -> IntArray:
     found = np.where(seen.corrected & (measured | ~done), FrameStatus.CORRECTED, found)
     found = np.where(failed, FrameStatus.NOT_MEASURABLE, found)
     found = np.where(status == PULSE, FrameStatus.PULSE, found)
-    doubtful = (done & seen.stale) | (measured & outlying_frames(seen))
-    return np.asarray(np.where(doubtful, FrameStatus.DOUBTFUL, found), np.int64)
+    found = np.where(measured & outlying_frames(seen), FrameStatus.DOUBTFUL, found)
+    return np.asarray(np.where(done & seen.stale, FrameStatus.OUT_OF_DATE, found), np.int64)
 
 
 def next_frame(

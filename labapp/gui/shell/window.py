@@ -257,7 +257,7 @@ class MainWindow(QMainWindow):
         if session is None:
             return
         if kind == "doubtful":
-            wanted, words = np.isin(self.frame_statuses, TO_CHECK), "in doubt"
+            wanted, words = np.isin(self.frame_statuses, TO_CHECK), "to be checked"
         else:
             corrected = session.corrected_frames()
             wanted, words = np.isin(session.frames, corrected), "corrected by hand"
