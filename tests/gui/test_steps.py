@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,18 @@ def test_line_pattern_renames_the_dots_step(tmp_path: Path) -> None:
         assert renamed.title == "Pattern"
         assert "lines" in renamed.hint
         assert all(step.of(session) == step for step in STEPS if step is not dots)
+
+
+def test_results_that_are_out_of_date_need_attention_in_every_step_that_shows_them(
+    copy_sample: CopySample,
+) -> None:
+    shown = ("surface", "trends", "export")
+    with Session.open(copy_sample("blocked_rows")) as session:
+        assert states(session)["trends"].mark is Mark.READY
+        session.set_settings(replace(session.settings, correspondence="S/S"))
+        found = states(session)
+    assert {found[key].mark for key in shown} == {Mark.ATTENTION}
+    assert len({found[key].why for key in shown}) == 1
 
 
 def test_recording_without_any_surface_needs_attention(tmp_path: Path) -> None:

@@ -269,7 +269,9 @@ def no_surface(count: int) -> str:
 
 
 def results(facts: Facts) -> State:
-    """State of a step that needs only results: ready as soon as there are any."""
+    """State of a step that needs only results: ready as soon as there are any up to date."""
+    if facts.stale:
+        return State(Mark.ATTENTION, _surface(facts).why)
     if facts.measured and facts.failed == facts.measured:
         return State(
             Mark.ATTENTION, f"{no_surface(facts.measured)}: check the {_seen(facts.session)}"
@@ -277,10 +279,6 @@ def results(facts: Facts) -> State:
     if facts.measured:
         return State(Mark.READY, pluralize(facts.measured, "frame"))
     return State(Mark.TODO, "Measure some frames first")
-
-
-def _export(facts: Facts) -> State:
-    return State(Mark.ATTENTION, _surface(facts).why) if facts.stale else results(facts)
 
 
 @dataclass(frozen=True)
@@ -397,7 +395,6 @@ STEPS = (
         "Export",
         "Tick what is to be exported, and choose a folder.",
         "ExportPage",
-        _export,
         shows="Tables, surfaces, pictures and the report, to be written into a folder.",
         needs_results=True,
     ),
