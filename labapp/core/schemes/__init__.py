@@ -105,13 +105,13 @@ SCHEMES: dict[str, Scheme] = {
         Scheme(
             "zonal",
             "zonal integration of slopes (Southwell)",
-            Words("zonal", "Zonal: slopes integrated between neighbours"),
+            Words("zonal", "Zonal: slopes between neighbours"),
             "ZonalSettings",
         ),
         Scheme(
             "modal",
             "modal integration of slopes (Zernike)",
-            Words("modal", "Modal: Zernike polynomials fitted to slopes"),
+            Words("modal", "Modal: Zernike polynomials"),
             "ModalSettings",
         ),
     )

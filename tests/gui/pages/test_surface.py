@@ -19,6 +19,8 @@ from PySide6.QtWidgets import (
     QFileDialog,
     QScrollArea,
     QSplitter,
+    QStyle,
+    QStyleOptionComboBox,
     QWidget,
 )
 from pytestqt.qtbot import QtBot
@@ -29,10 +31,11 @@ from labapp.export.rendering.paper import Paper
 from labapp.export.rendering.scene import DIFFERENCE_MAP
 from labapp.export.rendering.studio import Studio
 from labapp.gui.pages.surface.page import FILM_PX, SurfacePage
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.views.picture_files import PaperDialog, write_plot
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
-from tests.gui.conftest import KEPT, CopySample
+from tests.gui.conftest import KEPT, CopySample, let_draw
 from tests.waiting import PATIENCE_S
 
 
@@ -96,6 +99,27 @@ def test_choice_of_scheme_can_be_undone(page: SurfacePage) -> None:
     page.workspace.undo()
     assert page.side.scheme.value() == "fit"
     assert page.view.scene is not None
+
+
+def test_choices_are_not_cut_off_in_the_smallest_window(
+    window: MainWindow, copy_sample: CopySample
+) -> None:
+    assert window.files.open(copy_sample("gtaw"))
+    window.show_step("surface")
+    window.resize(680, 492)
+    let_draw()
+    for field in (window.page.side.scheme, window.page.side.correspondence):
+        combo = field.editor
+        option, part = QStyleOptionComboBox(), QStyle.SubControl.SC_ComboBoxEditField
+        combo.initStyleOption(option)
+        kind = QStyle.ComplexControl.CC_ComboBox
+        room = combo.style().subControlRect(kind, option, part, combo).width()
+        widths = combo.fontMetrics().horizontalAdvance
+        assert room >= max(widths(combo.itemText(k)) for k in range(combo.count()))
+        combo.showPopup()
+        let_draw()
+        assert combo.view().viewport().width() >= combo.view().sizeHintForColumn(0)
+        combo.hidePopup()
 
 
 def test_refused_scheme_is_not_shown(page: SurfacePage, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from labapp.gui.pages.surface.presenter import (
 )
 from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.fields import ChoiceField, FieldForm
+from labapp.gui.widgets.fields import ChoiceField
 from labapp.gui.widgets.labels import (
     Message,
     heading,
@@ -24,7 +24,7 @@ from labapp.gui.widgets.labels import (
     show_words,
     wrapping_label,
 )
-from labapp.gui.widgets.layouts import fill
+from labapp.gui.widgets.layouts import column_of, fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.results.measured import scheme_name
@@ -48,7 +48,9 @@ class SurfacePanel:
         )
         self.scheme.edited.connect(self._choose_scheme)
         self.correspondence.edited.connect(self._choose_correspondence)
-        form = FieldForm(self.scheme, self.correspondence)
+        fields = (self.scheme, self.correspondence)
+        # Labels above: beside them, a small window would cut the texts of the choices off.
+        form = column_of(*(part for field in fields for part in (field.label, field)))
         self.status, self.setup_words = wrapping_label(), wrapping_label()
         self.provenance, self.verdict = wrapping_label(), wrapping_label()
         self._stale = False
