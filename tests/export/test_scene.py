@@ -252,6 +252,20 @@ def test_colour_scale_names_its_quantity(plotter: Any, pool: Reconstruction) -> 
         assert label.replace(" (", "\n(") in drawing.overlay.words
 
 
+def test_stamp_is_framed_and_apart_from_the_colour_scale(
+    plotter: Any, pool: Reconstruction
+) -> None:
+    drawing = draws.build_scene(plotter, replace(scene_of(pool), stamp="out of date"))
+    screenshot(plotter)
+    texts = {text.GetInput(): text for text in drawing.overlay._texts if text.GetVisibility()}
+    framed = [words for words, text in texts.items() if text.GetTextProperty().GetFrame()]
+    assert framed == ["out of date"]
+    stamp, title = (texts[words].GetPosition()[1] for words in ("out of date", "height\n(mm)"))
+    scale = drawing.overlay._scale(np.array(plotter.window_size, float))
+    lowest = min(label.at_px[1] for label in scale)
+    assert stamp < lowest - 20 < title
+
+
 def test_drawing_recovers_from_a_failed_update(
     plotter: Any, pool: Reconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,7 +309,8 @@ def test_surface_can_follow_a_scene_without_one(plotter: Any, pool: Reconstructi
 def test_labels_are_visible_from_every_side_without_overlap(
     plotter: Any, pool: Reconstruction, exaggeration: float, azimuth_deg: float
 ) -> None:
-    drawing = draws.build_scene(plotter, replace(scene_of(pool), exaggeration=exaggeration))
+    scene = replace(scene_of(pool), exaggeration=exaggeration, stamp="out of date")
+    drawing = draws.build_scene(plotter, scene)
     plotter.camera.Azimuth(azimuth_deg + 10)
     screenshot(plotter)
     overlay, size = drawing.overlay, np.array(plotter.window_size)

@@ -52,6 +52,8 @@ class Label(NamedTuple):
     """Whether the text runs upwards."""
     plain: bool = True
     """Whether it has no background."""
+    framed: bool = False
+    """Whether it has a frame."""
 
     def edges(self, point_px: float) -> tuple[float, float, float, float]:
         """Return the left, lower, right and upper edge, px, for wide letters."""
@@ -124,7 +126,7 @@ class Overlay:
         self.scale: tuple[str, tuple[float, float], Any] | None = None
         """Label, range and VTK lookup table of the colours."""
         self.captions: dict[str, str] = {}
-        """Texts by position: ``upper left``, ``lower left``, ``upper right``, ``middle``."""
+        """Texts by position: ``upper left``, ``lower left``, ``lower right``, ``middle``."""
         self.mark: tuple[FloatArray, str] | None = None
         """A point of the surface, shape (3,), mm, and its label."""
         self.upright_mm = np.zeros((2, 3))
@@ -289,10 +291,15 @@ class Overlay:
         places = {
             "upper left": (np.array([edge, size[1] - edge]), (1.0, -1.0), CAPTION_PT),
             "lower left": (np.array([edge, edge]), (1.0, 1.0), CAPTION_PT),
-            "upper right": (size - edge, (-1.0, -1.0), CAPTION_PT),
+            # Framed, and not above the scale: it would be read as a part of the scale's title.
+            "lower right": (np.array([size[0] - 2 * edge, 2 * edge]), (-1.0, 1.0), CAPTION_PT),
             "middle": (np.array([0.12, 0.75]) * size, (1.0, -1.0), TITLE_PT + 2),
         }
-        return [Label(words, *places[where]) for where, words in self.captions.items() if words]
+        return [
+            Label(words, *places[where], framed=where == "lower right")
+            for where, words in self.captions.items()
+            if words
+        ]
 
     # --- drawing -----------------------------------------------------------------------------
 
@@ -305,6 +312,7 @@ class Overlay:
         style.SetFontFile(_font())
         style.SetColor(*self._colour)
         style.SetBackgroundColor(*self._plotter.background_color.float_rgb)
+        style.SetFrameColor(*self._colour)
         self._plotter.renderer.AddViewProp(text)
         return text
 
@@ -316,6 +324,7 @@ class Overlay:
         style.SetFontSize(label.size_pt)
         style.SetOrientation(90.0 if label.upright else 0.0)
         style.SetBackgroundOpacity(0.0 if label.plain else 0.75)
+        style.SetFrame(label.framed)
         across, up = label.side
         style.SetJustification(1 - (up if label.upright else across))
         style.SetVerticalJustification(1 + (across if label.upright else -up))

@@ -260,7 +260,7 @@ class Drawing:
         captions = [f"heights drawn {high:g} times as high"] * (high != 1)
         captions += ["upright line: the electrode's axis"] * scene.electrode
         captions += [f"contour lines every {contour:g} mm of height"] * (contour > 0)
-        places = ("upper left", "upper right", "middle")
+        places = ("upper left", "lower right", "middle")
         texts = ("\n".join(captions), scene.stamp, scene.notice)
         self.overlay.captions = dict(zip(places, texts, strict=True))
 

@@ -74,7 +74,7 @@ class Scene(ReadOnlyArrays):
     mark_words: str = ""
     """Label of the marked point."""
     stamp: str = ""
-    """Text in the upper right corner."""
+    """Text in a frame in the lower right corner."""
     notice: str = ""
     """Text in the middle: why there is no surface."""
     foreground: str = "#202020"
