@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MEASURING, MISSING = "Measuring", "Recording"
+MEASURING, MISSING, EDITING = "Measuring", "Recording", "Editing"
 """Causes of problems, see `Workspace.say_wrong`."""
 
 MEASURED_S = 0.25
@@ -174,17 +174,20 @@ class Workspace(QObject):
     def attempt(
         self,
         change: Callable[[Session], object],
-        cause: str = "",
+        cause: str = EDITING,
         beside: Callable[[str], object] | None = None,
     ) -> bool:
         """Change the session; report an error and return False if it fails.
 
+        A refused change is reported until the next one is stored.
         `changed` is emitted either way: fields must not go on showing what was refused.
         """
         session = self.session
         if session is None:
             return False
         done = self.run_or_report(lambda: (change(session),), cause, beside) is not None
+        if done:
+            self.settle(EDITING)
         self.changed.emit()
         return done
 
@@ -200,7 +203,7 @@ class Workspace(QObject):
         session = self.session
         if session is None:
             return
-        step = self.run_or_report(session.undo if name == "undo" else session.redo)
+        step = self.run_or_report(session.undo if name == "undo" else session.redo, EDITING)
         self.notified.emit(nothing if step is None else f"{done}: {step.label}", False)
         if step is not None:
             frames = [frame for _, frame in step.keys if frame >= 0]

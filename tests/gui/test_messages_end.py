@@ -10,6 +10,7 @@ from PySide6.QtCore import QPoint, QRect
 from PySide6.QtWidgets import QAbstractButton, QLabel
 from pytestqt.qtbot import QtBot
 
+from labapp.errors import InputError
 from labapp.gui.pages.export import page as export_page
 from labapp.gui.pages.setup.page import BENCH_TAB
 from labapp.gui.shell.window import MainWindow
@@ -70,6 +71,28 @@ def test_full_disk_message_ends_with_a_successful_export(
     assert opened.status_line.unread == []
     assert "No space left" not in opened.status_line.message.text()
     assert "No space left" not in page.answer.text()
+    assert any("No space left" in line for line in opened.log_panel.texts())
+
+
+def test_full_disk_message_of_a_change_ends_with_the_next_stored_change(
+    opened: MainWindow, monkeypatch: pytest.MonkeyPatch
+):
+    def full(*_: object) -> None:
+        raise InputError("a.labsession", "file", "No space left on device", "enough of it")
+
+    opened.show_step("setup")
+    record = opened.page.record_fields
+    for change_again in (
+        lambda: record["operator"].edited.emit("K. Ito"),
+        lambda: opened.do("undo"),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(Session, "set_record", full)
+            record["title"].edited.emit("Refused")
+        assert len(opened.status_line.unread) == 1
+        assert "No space left" in opened.status_line.message.text()
+        change_again()
+        assert opened.status_line.unread == []
     assert any("No space left" in line for line in opened.log_panel.texts())
 
 
