@@ -260,7 +260,7 @@ class Workspace(QObject):
             return
         pool = self._measuring_pool(warm)
 
-        def work(control: Control) -> tuple[int, int]:
+        def work(control: Control) -> tuple[int, int, int]:
             done, failed, emitted_s = 0, 0, 0.0
             numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
             try:
@@ -281,15 +281,13 @@ class Workspace(QObject):
                 raise ValueError(
                     "a process that measures has ended; what was measured is kept: measure again"
                 ) from error
-            return done, failed
+            return done, failed, _count_stale(session, numbers)
 
-        def finished(counts: tuple[int, int]) -> None:
-            done, failed = counts
-            words = f"{pluralize(done, 'frame')} measured"
-            words += f", {failed} without a surface" if failed else ""
+        def finished(counts: tuple[int, int, int]) -> None:
+            words = measured_text(*counts)
             self.notified.emit(words, False)
             if beside is not None:
-                beside(f"{PROBLEM if failed else DONE} {words}")
+                beside(f"{PROBLEM if any(counts[1:]) else DONE} {words}")
 
         def kept(seen: Overview | None) -> None:
             if seen is None:
@@ -315,3 +313,19 @@ class Workspace(QObject):
         if ended:
             self._measuring = [task for task in self._measuring if task not in ended]
             self.changed.emit()
+
+
+def measured_text(done: int, failed: int, stale: int) -> str:
+    """Text of the numbers of frames measured, without a surface, and out of date at the end."""
+    words = f"{pluralize(done, 'frame')} measured"
+    words += f", {failed} without a surface" if failed else ""
+    if stale:
+        words += f", {stale} already out of date by a change meanwhile: measure again (F5)"
+    return words
+
+
+def _count_stale(session: Session, numbers: Sequence[int]) -> int:
+    """Number of these frames whose results are out of date."""
+    seen, wanted = session.overview(), set(numbers)
+    pairs = zip(seen.frame.tolist(), seen.stale.tolist(), strict=True)
+    return sum(stale and frame in wanted for frame, stale in pairs)

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import logging
+import threading
+from collections.abc import Iterator
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.tasks import DONE
-from labapp.gui.workspace import Workspace
+from labapp.gui.tasks import DONE, PROBLEM
+from labapp.gui.workspace import Workspace, measured_text
 from labapp.log import NAME
 from labapp.run import measurers
 from labapp.session.session import Session
 from labapp.simulation import parallel
 from tests.gui.conftest import CopySample
 from tests.gui.watching import FaultHandler
+from tests.waiting import PATIENCE_S
 
 
 class Stuck(Executor):
@@ -47,6 +51,35 @@ def test_followed_frames_and_pulses_are_no_failures(
         workspace.measure(range(12), beside=beside.append)
     assert messages == ["12 frames measured"]
     assert beside[-1] == f"{DONE} 12 frames measured"
+    workspace.close()
+
+
+def test_frames_out_of_date_by_a_change_while_measuring_are_reported(
+    qapp: QApplication, state: object, copy_sample: CopySample, qtbot: QtBot,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    workspace, begun, changed = Workspace(), threading.Event(), threading.Event()
+    workspace.show(Session.open(copy_sample("thumb_tack")))
+    session = workspace.session
+    measure_each = session.measure_each
+
+    def held(numbers: list[int], pool: object, *, warm: bool) -> Iterator[tuple[int, Any]]:
+        for each in measure_each(numbers):
+            begun.set()
+            changed.wait(PATIENCE_S)
+            yield each
+
+    monkeypatch.setattr(session, "measure_each", held)
+    beside: list[str] = []
+    workspace.measure([0], beside=beside.append)
+    qtbot.waitUntil(begun.is_set)
+    assert workspace.attempt(
+        lambda own: own.set_settings(replace(own.settings, correspondence="S/S"))
+    )
+    with qtbot.waitSignal(workspace.notified) as told:
+        changed.set()
+    assert told.args[0] == measured_text(1, 0, 1) != measured_text(1, 0, 0)
+    assert beside[-1].startswith(PROBLEM)
     workspace.close()
 
 
