@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from pathlib import Path
 
 from labapp.errors import os_errors_as_input
 from labapp.files import regular_size
+from labapp.media.formats.images import IMAGE_SUFFIXES
 
 PAIRED = frozenset({".cih", ".cihx", ".mraw"})
 
@@ -34,15 +36,30 @@ def identify(path: Path) -> tuple[int, str]:
     return size, hashlib.sha256(repr(digests).encode()).hexdigest()
 
 
-def size_of(path: Path) -> int:
-    """Return the size of a recording in bytes, as `identify` does, without reading it.
+def may_be(path: Path, size: int, frames: int) -> bool:
+    """Whether a recording can be that of this size (`identify`) and number of frames, unread.
+
+    Files that are no images may have been added to a folder, such as the session itself.
 
     Raises
     ------
     OSError
         If a file is missing.
     """
-    return sum(file.stat().st_size for file in _files(path))
+    if not path.is_dir():
+        return sum(file.stat().st_size for file in _files(path)) == size
+    images = image_byte = total_byte = 0
+    with os.scandir(path) as entries:  # gives sizes faster than `Path.stat`
+        for entry in entries:
+            if entry.name.startswith("."):
+                continue
+            is_image = os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES
+            images += is_image
+            if entry.is_file():
+                byte = entry.stat().st_size
+                total_byte += byte
+                image_byte += byte * is_image
+    return image_byte <= size <= total_byte and (images < 2 or images == frames)
 
 
 def stamp(path: Path) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -25,7 +26,7 @@ from labapp.export.summary import format_ranges
 from labapp.files import relative_path
 from labapp.media import Frame, FrameSource, GreyImage, open_source
 from labapp.media.formats.images import decoded
-from labapp.media.identity import identify, size_of
+from labapp.media.identity import identify, may_be
 from labapp.media.survey import Survey, frame_checksum, survey
 from labapp.run.runner import select_frames
 from labapp.session.file.blobs import MAGIC, pack, unpack_from
@@ -51,6 +52,8 @@ class Frames:
         self._mutex = threading.RLock()
         self._source: FrameSource | None = None
         self._cache = ReadCache(database)
+        self._compared: tuple[tuple[object, ...], bool] | None = None
+        """What `replaced` has compared last, and whether it can be the recording."""
 
     @property
     def recording(self) -> Recording | None:
@@ -279,15 +282,23 @@ class Frames:
 
     @property
     def replaced(self) -> Path | None:
-        """Path at which there is a file of another size than the imported one; None if not.
+        """Path at which there is another recording than the imported one, by size; None if not.
 
-        Folders are not looked through. Frames are compared with the imported ones when read.
+        Frames are compared with the imported ones when read.
         """
         recording = self.recording
-        if recording is None or recording.embedded or not self._place().is_file():
+        if recording is None or recording.embedded:
             return None
+        place = self._place()
         with suppress(OSError):
-            return self._place() if size_of(self._place()) != recording.size else None
+            about = place.stat()
+            if not stat.S_ISDIR(about.st_mode) and not stat.S_ISREG(about.st_mode):
+                return None
+            # A folder is looked through again only after files were added, renamed or removed.
+            key = (place, about.st_mtime_ns, about.st_size, recording.size)
+            if self._compared is None or self._compared[0] != key:
+                self._compared = key, may_be(place, recording.size, recording.frames)
+            return None if self._compared[1] else place
         return None
 
     def refuse_missing(self) -> None:

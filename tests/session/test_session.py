@@ -349,6 +349,44 @@ def test_replaced_recording_is_detected(folder: Path):
             session.relink(folder / "recording.avi")
 
 
+def write_images(folder: Path, count: int = 5, highest: int = 255) -> Path:
+    rng = np.random.default_rng(4)
+    for k, image in enumerate(rng.integers(0, highest, (count, 20, 30), np.uint8)):
+        cv2.imwrite(str(folder / f"{k}.png"), image)
+    return folder
+
+
+def test_folder_with_more_files_beside_its_images_is_the_recording(tmp_path: Path):
+    images = write_images(tmp_path)
+    with Session.create(images / "a.labsession") as session:
+        session.import_recording(images)
+        session.set_record(Record(notes="x" * 100_000))
+        assert session.replaced_recording is None
+    (images / "notes.txt").write_text("wire 1.2 mm")
+    with Session.open(images / "a.labsession") as session:
+        assert session.replaced_recording is None
+        session.frame(0)
+
+
+@pytest.mark.parametrize(("count", "highest"), [(5, 15), (4, 255), (6, 255), (5, 256)])
+def test_folder_with_other_images_is_detected_and_may_be_put_back(
+    tmp_path: Path, count: int, highest: int
+):
+    images, before = tmp_path / "images", tmp_path / "before"
+    images.mkdir()
+    with Session.create(tmp_path / "a.labsession") as session:
+        session.import_recording(write_images(images, highest=100))
+    images.rename(before)
+    images.mkdir()
+    write_images(images, count, highest)
+    with Session.open(tmp_path / "a.labsession") as session:
+        assert session.missing_recording is None
+        assert session.replaced_recording == images
+        shutil.rmtree(images)
+        before.rename(images)
+        assert session.replaced_recording is None
+
+
 def test_changed_frames_are_detected(folder: Path):
     rng = np.random.default_rng(4)
     frames = rng.integers(0, 255, (3, 20, 30), np.uint8)
