@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 
@@ -16,6 +16,14 @@ LEAST_ANGLE_DEG = 10.0
 
 UNDONE_PX = 0.01
 """Largest error of a distortion that is undone, px."""
+
+SAMPLES = 65
+"""Number of points on each edge of the imaging plane, and on each line from the picture's middle to
+them, at which a distortion is assessed.
+"""
+
+ROUNDING = 1e-9
+"""Largest rounding error of a point's distance from the principal point, in focal lengths."""
 
 
 @np.errstate(all="ignore")  # huge numbers become NaN, which is a problem, too
@@ -38,12 +46,16 @@ def view_problems(
     if "homography" not in keys:
         seen = np.array([keys[f"{name}_px"] for name in ("origin", "x_axis", "z_axis")], float)
         ideal = calibration.undistorted.ideal_px(seen)
-        return [*_nearly_one_line(path, seen), *_folded(path, calibration, ideal, seen)]
+        folded = _folded(path, calibration, ideal, seen) or _folded_elsewhere(
+            path, values, calibration
+        )
+        return [*_nearly_one_line(path, seen), *folded]
     if horizon := _horizon(path, calibration, size):
         return horizon
     points = np.vstack([np.zeros(2), np.diag(keys.get("points_mm", size / 2))])
     flat = ImageCalibration(calibration.matrix).to_image(points)
-    return _folded(path, calibration, flat, calibration.undistorted.to_image(points))
+    seen = calibration.undistorted.to_image(points)
+    return _folded(path, calibration, flat, seen) or _folded_elsewhere(path, values, calibration)
 
 
 def _nearly_one_line(path: Path, seen: FloatArray) -> list[InputError]:
@@ -91,11 +103,39 @@ def _folded(
     errors = [*(lens.distorted(ideal) - seen).flat, *(lens.ideal(seen) - ideal).flat]
     if np.abs(errors).max() <= UNDONE_PX:  # also False for NaN
         return []
-    return [
-        InputError(
-            path,
-            "camera_lens.distortion",
-            list(lens.distortion),
-            "a distortion that can be undone at O′ and on the axes: calibrate the lens again",
-        )
+    return [_not_undone(path, lens, "at O′ and on the axes")]
+
+
+def _folded_elsewhere(
+    path: Path, values: dict[str, dict[str, Any]], calibration: ImageCalibration
+) -> list[InputError]:
+    """Find a lens that maps several points of the imaging plane to one point of the picture.
+
+    From the principal point to the plane's edges, the distorted points must move outward until they
+    leave the picture; what a distortion does outside the picture does not matter.
+    """
+    lens = calibration.plain_lens
+    if lens is None:
+        return []
+    plane, middle = values["imaging_plane"], np.array(lens.center_px)
+    # Without the size of the picture: the principal point is about its middle.
+    frame_px = np.array(values["image_calibration"].get("frame_px", 2 * middle), float)
+    part = np.linspace(0.0, 1.0, SAMPLES)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * [
+        plane["width_mm"],
+        plane["height_mm"],
     ]
+    edges = corners[:-1, None] + part[:, None] * np.diff(corners, axis=0)[:, None]
+    ends = ImageCalibration(calibration.matrix).to_image(edges.reshape(-1, 2))
+    seen = lens.distorted(middle + part[:, None] * (ends - middle)[:, None])
+    within = ((seen >= 0) & (seen <= frame_px)).all(axis=-1)
+    inside = np.logical_and.accumulate(within, axis=1)[:, :-1]
+    far = np.hypot(*np.moveaxis((seen - middle) / lens.focal_px, -1, 0))
+    if not (inside & (np.diff(far, axis=1) < -ROUNDING)).any():
+        return []
+    return [_not_undone(path, lens, "on all of the imaging plane")]
+
+
+def _not_undone(path: Path, lens: Lens, where: str) -> InputError:
+    expected = f"a distortion that can be undone {where}: calibrate the lens again"
+    return InputError(path, "camera_lens.distortion", list(lens.distortion), expected)

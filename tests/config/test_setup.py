@@ -213,6 +213,31 @@ def test_distortion_that_cannot_be_undone_is_rejected(path: Path, k1: float, poi
     read_setup(change(path, f"[{k1},", "[-0.3,"))
 
 
+@pytest.mark.parametrize(
+    ("frame_px", "k1", "valid"),
+    [
+        ("", -0.8, False),  # at O′ and on the axes it can be undone
+        ("frame_px = [480, 640]", -0.8, False),
+        ("frame_px = [480, 640]", -0.5, True),
+        ("", -0.5, True),
+    ],
+)
+def test_distortion_that_folds_beside_the_axes_is_rejected(
+    path: Path, frame_px: str, k1: float, valid: bool
+) -> None:
+    text = path.read_text()
+    lens = "focal_px = [800, 800]\ncenter_px = [240, 320]\n"
+    lens += f"distortion = [{k1}, 0, 0, 0, 0]\n"
+    text = text.replace("[image_calibration]", f"[image_calibration]\n{frame_px}")
+    path.write_text(f"{text}\n[camera_lens]\n{lens}")
+    if valid:
+        read_setup(path)
+        return
+    with pytest.raises(InputError) as caught:
+        read_setup(path)
+    assert [each.field for each in caught.value.problems] == ["camera_lens.distortion"]
+
+
 def test_pattern_without_rays_is_rejected(path: Path) -> None:
     rays = [[i, j] for i in range(1, 20) for j in range(1, 20)]
     change(path, "rows = 19\n", f"rows = 19\nabsent = {rays}\n")
