@@ -132,9 +132,15 @@ def pace_text(
     if age_s > OLD_S:
         parts.append(f"▲ The figures are {age_s:.0f} s old.")
     came = f" of {came_hz:.1f}" if came_hz is not None else ""
-    parts.append(f"{pace.measured_hz:.1f}{came} frames/s measured")
+    rate = f"{pace.measured_hz:.1f}{came} frames/s"
     if age_s <= OLD_S:
-        parts[-1] += f"; {age_s:.2f} s old"
+        parts.append(f"{rate} measured; {age_s:.2f} s old")
+    elif pace.measured_hz:
+        parts.append(f"Measuring lags behind the camera: {rate}")
+    elif came_hz == 0:
+        parts.append("No frames arrive at present")
+    else:
+        parts.append(f"None{came} frames/s measured" if came else "No frame was measured since")
     if skipped:
         parts[-1] += f"; {pluralize(skipped, 'frame')} skipped to keep up"
     return " ".join(parts)

@@ -111,6 +111,23 @@ def test_pace_text_explains_missing_figures_and_the_rate():
     assert dark.endswith("1 frame skipped to keep up")
 
 
+@pytest.mark.parametrize(
+    ("measured_hz", "came_hz", "words"),
+    [
+        (12.0, 58.9, "Measuring lags behind the camera: 12.0 of 58.9 frames/s"),
+        (0.0, 58.9, "None of 58.9 frames/s measured"),
+        (0.0, 0.0, "No frames arrive at present"),
+        (0.0, None, "No frame was measured since"),
+    ],
+)
+def test_pace_text_of_old_figures_does_not_claim_that_frames_are_measured_now(
+    measured_hz: float, came_hz: float | None, words: str
+):
+    pace = Pace(measured_hz, round(2 * measured_hz), 0)
+    found = pace_text(live_result(), pace, came_hz, 4.0, 0)
+    assert found == f"▲ The figures are 4 s old. {words}"
+
+
 def test_live_figures_show_the_status_of_the_setup():
     assert live_setup_words(None, "") == live_setup_words(live_result(), "") == ""
     checked = live_result(replace(OK, setup_status="checked"))
