@@ -52,6 +52,8 @@ class Workspace(QObject):
     """Another frame is in view."""
     notified = Signal(str, bool)
     """A message for the operator: its text, and whether it is a problem."""
+    urgent = Signal(str)
+    """Data are lost by the problem that is notified next: its text. Others come after it."""
     settled = Signal(str)
     """A reported problem is solved: its text."""
     action_requested = Signal(str)

@@ -291,6 +291,11 @@ class Live:
         """The current recording."""
         return self._recorders[-1].running if self._recorders else None
 
+    @property
+    def is_failing(self) -> bool:
+        """Whether frames of the current recording are lost, as it cannot be written."""
+        return self.running is not None and bool(self.running.trouble)
+
     def rate_hz(self) -> float | None:
         """Current frame rate, 1/s; None if unknown."""
         now_s, counted = time.monotonic(), self._counted
@@ -332,9 +337,12 @@ class Live:
     def recording_text(self) -> str:
         """Text of the current or last recording, and the remaining recording time."""
         take, parts = self.running, []
+        if take is not None and take.trouble:
+            written = f"{pluralize(take.frames, 'frame')} written before are intact"
+            lost = pluralize(take.lost, "frame")
+            return f"▲ NOT RECORDED: {lost} lost; {take.trouble}. {written}"
         if take is not None:
             parts = [f"● Recording: {pluralize(take.frames, 'frame')} written, {take.lost} lost"]
-            parts += [f"▲ {take.trouble}"] * bool(take.trouble)
         elif self.takes and not self.takes[-1].finished.is_set():
             parts = [f"Writing the rest of {self.takes[-1].path.name}"]
         elif self.takes:

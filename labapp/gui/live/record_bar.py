@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from PySide6.QtCore import Qt
 from PySide6.QtGui import QPalette
 from PySide6.QtWidgets import QProgressBar, QWidget
 
@@ -66,6 +67,19 @@ class RecordBar(QWidget):
         self.ring.setFormat(message)
         self.ring.setAccessibleName(f"Kept from before the trigger: {message}")
         self.recording.setText(live.recording_text())
+        self._show_failing(live.is_failing)
+
+    def _show_failing(self, failing: bool) -> None:
+        """Show whether frames are lost: in bold on red, as it must not be overlooked."""
+        if failing == self.recording.autoFillBackground():
+            return
+        palette = QPalette()
+        if failing:
+            palette.setColor(QPalette.ColorRole.Window, RED[False])
+            palette.setColor(QPalette.ColorRole.WindowText, Qt.GlobalColor.white)
+        self.recording.setPalette(palette)
+        self.recording.setAutoFillBackground(failing)
+        set_font(self.recording, bold=failing)
 
     def show_recording(self, recording: bool) -> None:
         """Show on the record button whether a recording runs: by text, sign and red colour."""

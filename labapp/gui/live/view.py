@@ -392,6 +392,8 @@ class LiveView(QObject):
         """Report an event; lost frames are a problem only while they are recorded."""
         recorded = live.running is not None or event.source != live.name
         problem = event.kind == "warning" or (event.kind == "loss" and recorded)
+        if problem and event.kind == "loss":
+            self.workspace.urgent.emit(str(event))
         self.workspace.notified.emit(str(event), problem)
 
     def _show_status(self, live: Live) -> None:

@@ -88,6 +88,8 @@ class StatusLine(QWidget):
         super().__init__()
         self._tasks = tasks
         self.unread: list[str] = []
+        """Problems; the last one is shown."""
+        self._urgent: set[str] = set()
         self.message = Message(1)
         self.message.setAccessibleName("Last message")
         tip = "Remove the problem from this line; it stays among the messages (F4)"
@@ -118,10 +120,16 @@ class StatusLine(QWidget):
     def say(self, text: str, problem: bool) -> None:
         """Show a message unless there is an unread problem; each problem is counted once."""
         if problem:
-            self.unread[:] = [*(each for each in self.unread if each != text), text]
+            unread = [*(each for each in self.unread if each != text), text]
+            self.unread[:] = sorted(unread, key=self._urgent.__contains__)
+            text = self.unread[-1]
         elif self.unread:
             return
         self._show_message(text)
+
+    def put_first(self, text: str) -> None:
+        """Show this problem, once it is said, before all that are not urgent."""
+        self._urgent.add(text)
 
     def settle(self, text: str) -> None:
         """Remove a solved problem from the line, read or not; the log keeps it."""
@@ -132,6 +140,7 @@ class StatusLine(QWidget):
     def mark_read(self) -> None:
         """Remove the problems, and any other message, from the line."""
         self.unread.clear()
+        self._urgent.clear()
         self._show_message("")
 
     def cancel(self) -> None:

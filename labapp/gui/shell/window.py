@@ -149,6 +149,7 @@ class MainWindow(QMainWindow):
         space.changed.connect(self._changed)
         space.measured.connect(self._show_measured)
         space.frame_changed.connect(self._frame_changed)
+        space.urgent.connect(self.status_line.put_first)
         space.notified.connect(self.say)
         space.settled.connect(self.status_line.settle)
         space.action_requested.connect(self.do)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import threading
 import time
 import tomllib
@@ -28,6 +29,7 @@ from labapp.gui.live.figures import LINES, Figure, figures
 from labapp.gui.live.live import SIMULATED, STATES, WAITS, Live, choices
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.shell.window import MainWindow
+from labapp.gui.theme import RED
 from labapp.gui.widgets.exposure import LINES_NOT_JUDGED
 from labapp.media import GreyImage, open_source
 from labapp.media.cameras import (
@@ -36,7 +38,9 @@ from labapp.media.cameras import (
     CameraSettings,
     SimulatedDevice,
 )
+from labapp.media.recording.nut import NutWriter
 from labapp.media.recording.recorder import Plan
+from labapp.media.recording.take_files import TakeFiles
 from labapp.run import live_watch
 from labapp.run.limits import Limits
 from labapp.run.live_measuring import LiveResult
@@ -396,6 +400,32 @@ def test_start_record_and_import_by_mouse_and_keyboard(
     with Session.open(session.path) as previous:
         assert len(previous.frames) == take.frames
         assert previous.problems() == []
+
+
+def test_full_disk_is_the_prominent_message_while_frames_are_lost(
+    window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    start(page, qtbot)
+    view, line = page.live_view, window.status_line
+    view.trigger()
+    qtbot.waitUntil(lambda: view.recording.frames > 3)
+    assert not view.bar.recording.font().bold()
+    monkeypatch.setattr(NutWriter, "write", full)
+    monkeypatch.setattr(TakeFiles, "_note", full)
+    qtbot.waitUntil(lambda: view.bar.recording.text().startswith("▲"))
+    assert view.recording.trouble in view.bar.recording.text()
+    assert view.bar.recording.font().bold()
+    shown = view.bar.recording.grab().toImage().pixelColor(1, 1)
+    assert shown == RED[False]
+    qtbot.waitUntil(lambda: view.recording.trouble in line.message.text())
+    window.workspace.notified.emit("Not all notes can be written", True)
+    assert len(line.unread) == 2
+    assert view.recording.trouble in line.message.text()
+    view.trigger()
+    qtbot.waitUntil(lambda: not view.bar.recording.font().bold())
 
 
 def test_large_figures_are_shown_if_the_setup_is_complete(
