@@ -76,6 +76,12 @@ def pluralize(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' * (count != 1)}"
 
 
+def capitalized(words: str) -> str:
+    """Begin a text with a capital letter, unless it begins with the name of a file."""
+    first, *_ = words.split(" ")
+    return words if "." in first.rstrip(".") else words[:1].upper() + words[1:]
+
+
 BYTES = ("bytes", "kB", "MB", "GB", "TB")
 
 

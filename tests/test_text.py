@@ -9,6 +9,7 @@ import pytest
 from labapp.text import (
     SETUP_MARKS,
     SETUP_WORDS,
+    capitalized,
     local_time,
     marked_setup_words,
     setup_words,
@@ -69,3 +70,16 @@ def test_a_time_that_cannot_be_read_is_shown_as_it_is(text: str) -> None:
 )
 def test_unit_is_read_from_the_end_of_a_name(name: str, words: str, unit: str) -> None:
     assert split_unit(name) == (words, unit)
+
+
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        ("too few dots", "Too few dots"),
+        ("no.", "No."),
+        ("recording.avi is missing", "recording.avi is missing"),
+        ("", ""),
+    ],
+)
+def test_capital_letters_leave_names_of_files_alone(words: str, shown: str):
+    assert capitalized(words) == shown

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from labapp.errors import InputError
 from labapp.session.calibrations import calibrations_in_use
 from labapp.session.results.statuses import is_failed
-from labapp.text import pluralize, split_unit
+from labapp.text import capitalized, pluralize, split_unit
 
 if TYPE_CHECKING:
     from labapp.session.results.measured import Overview
@@ -90,7 +90,7 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
     ]
     typed = [f"enter {', '.join(enter)}"] if enter else []
     words = "; ".join([*wrong, *typed, *calibrate])
-    return words[:1].upper() + words[1:]
+    return capitalized(words)
 
 
 READ_ONLY = "The session is open read-only: nothing can be changed"

@@ -36,7 +36,7 @@ from labapp.gui.pages.bench_check.listed_picture import ListedPicture
 from labapp.media.formats.images import IMAGE_SUFFIXES
 from labapp.session.record import BenchCheckRecord, MirrorPicture, Record
 from labapp.session.session import Session
-from labapp.text import now, plain, with_sigma
+from labapp.text import capitalized, now, plain, with_sigma
 
 PICTURES = IMAGE_SUFFIXES
 """Suffixes of pictures that can be dropped on the page."""
@@ -226,7 +226,7 @@ def _fit_words(record: BenchCheckRecord) -> str:
 
 
 def _sentence(words: str, end: str = ".") -> str:
-    return words[:1].upper() + words[1:] + end
+    return capitalized(words) + end
 
 
 # --- what is shown of it ------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_lab
 from labapp.gui.widgets.layouts import vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
+from labapp.text import capitalized
 
 END = 11.0
 """Diameter of the mark of an end, points of the screen."""
@@ -113,7 +114,7 @@ class LinesPanel(QWidget):
     def show_frame(self, state: LinesState) -> None:
         """Show the session's data of the frame in view."""
         self.seen.setText(state.words)
-        show_words(self.why, f"⚠ {state.why}" if state.why else "")
+        show_words(self.why, f"⚠ {capitalized(state.why)}" if state.why else "")
         self.lines.show_lines(state.listed)
         self.rows.set_rows(state.rows)
 

@@ -33,6 +33,7 @@ from labapp.gui.widgets.labels import Message, heading, offer, plain_label
 from labapp.gui.widgets.layouts import Group, reveal, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
+from labapp.text import capitalized
 
 LEADS = (("Measure", MEASURE_ACTIONS), ("To measure, the set-up is missing", SETUP_ACTIONS))
 
@@ -95,7 +96,7 @@ class DotsPanel(QWidget):
         self, seen: str, why: str, fit: Sequence[ResultRow], rows: Sequence[RowLine] | None
     ) -> None:
         """Show the session's data of the frame in view; None keeps the list of rows."""
-        self.seen.setText(f"{seen}\n⚠ {why}." if why else seen)
+        self.seen.setText(f"{seen}\n⚠ {capitalized(why)}." if why else seen)
         self.fit.set_rows(fit)
         if rows is not None:
             self.rows.show_lines(rows)

@@ -31,7 +31,7 @@ from labapp.session.results.trends import (
 )
 from labapp.session.session import Session
 from labapp.session.signals import Signals
-from labapp.text import SIGMA_OF, marked_setup_words, pluralize, rounded
+from labapp.text import SIGMA_OF, capitalized, marked_setup_words, pluralize, rounded
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.steps import Event
@@ -289,7 +289,7 @@ def _spectrum(course: Trend | None, timed: bool) -> tuple[tuple[Curve, ...], Axi
     try:
         found = spectrum(course)
     except ValueError as error:
-        return (), axis, str(error)[:1].upper() + str(error)[1:]
+        return (), axis, capitalized(str(error))
     quantity = course.quantity
     curve = Curve(
         f"Amplitude, {quantity.label.lower()}" if quantity.label != "ARE" else "Amplitude, ARE",
