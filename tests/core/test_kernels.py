@@ -334,6 +334,27 @@ def test_behind_torch_agrees_with_reflected_rays() -> None:
     np.testing.assert_array_equal(ray_kernels.behind_torch(points, rays, slopes, 2.4), hidden)
 
 
+def test_rim_of_the_far_side_is_below_dark_rays_that_nothing_stops() -> None:
+    """A bowl: two rays at its near side, which dip, and one aside, whose way is free."""
+    basis = SplineBasis(np.linspace(-4.0, 4.0, 17), np.linspace(-4.0, 4.0, 17))
+    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-4, 4, 40), np.linspace(-4, 4, 40)))
+    coefficients = np.linalg.lstsq(basis.matrix(x, y), 0.06 * (x**2 + y**2), rcond=None)[0]
+    places = np.array([[1.5, 0.0], [0.0, 2.6], [0.0, 2.8], [2.0, 0.0]])
+    points = np.column_stack([places, 0.06 * np.sum(places**2, axis=1)])
+    rays = np.tile([0.0, -np.cos(np.radians(30.0)), -0.5], (4, 1))
+    lit = np.array([True, False, False, False])
+
+    def stopped(dark: list[bool]) -> list[bool]:
+        surface = basis.grid, coefficients
+        masks = lit, np.array(dark)
+        found = ray_kernels.stopped_by_far_side(surface, points, rays, 0.12 * places, *masks)
+        return np.asarray(found).tolist()
+
+    assert stopped([False, True, True, False]) == [False, True, True, False]
+    assert stopped([False, True, True, True]) == [False, False, False, False]
+    assert stopped([False, False, False, False]) == [False, False, False, False]
+
+
 def test_recurrence_is_ridge_least_squares() -> None:
     slopes, rays, order = random().normal(0.0, 1.0, (30, 40, 2)), np.arange(0, 40, 3), 4
     series = slopes[:, rays].reshape(30, -1)

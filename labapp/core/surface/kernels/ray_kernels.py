@@ -309,7 +309,7 @@ def _meet_again(
         x, y, z = _reflected(rays[k], slopes[k, 0], slopes[k, 1])
         step = AGAIN_STEP_MM / np.hypot(x, y)
         at_x, at_y, at_z = points[k, 0], points[k, 1], points[k, 2]
-        while at_z < rim and not met[k]:
+        while at_z <= rim and not met[k]:
             at_x, at_y, at_z = at_x + step * x, at_y + step * y, at_z + step * z
             if not (grid[0, 0] <= at_x <= grid[0, 1] and grid[1, 0] <= at_y <= grid[1, 1]):
                 met[k] = z <= 0.0
