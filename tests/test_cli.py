@@ -358,6 +358,15 @@ def test_signal_in_a_compiler_callback_stops_the_program(sent: signal.Signals, c
     assert "Traceback" not in done.stderr
 
 
+def run_code(code: str) -> subprocess.CompletedProcess[str]:
+    """Run code in another Python."""
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+
+
 INTERRUPTED_AT_THE_START = """
 import runpy, signal, sys
 
@@ -373,11 +382,7 @@ runpy.run_module("labapp", run_name="__main__")
 
 
 def test_ctrl_c_while_the_commands_are_loaded_stops_the_program() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", INTERRUPTED_AT_THE_START],
-        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    )  # fmt: skip
+    done = run_code(INTERRUPTED_AT_THE_START)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
@@ -396,11 +401,7 @@ runpy.run_module("labapp", run_name="__main__")
 
 
 def test_ctrl_c_when_all_is_done_changes_nothing() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", INTERRUPTED_AT_THE_END],
-        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    )  # fmt: skip
+    done = run_code(INTERRUPTED_AT_THE_END)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("labapp ")
 

@@ -125,11 +125,8 @@ def test_dots_beside_and_between_the_same_labels_are_a_row() -> None:
     dots = np.sum(labels[second] != UNLABELLED)
     labels[second], labels[first] = labels[first], UNLABELLED
     observed, found = hypothesis(seen, labels)
-    assert (
-        found.stray_count
-        == unexplained._strays_in_line(observed, found.labels, found.stray_dots)
-        == dots
-    )
+    in_line = unexplained._strays_in_line(observed, found.labels, found.stray_dots)
+    assert found.stray_count == in_line == dots
     assert not suffices(observed, found)
 
 

@@ -128,7 +128,7 @@ class StatusLine(QWidget):
         self._show_message(text)
 
     def put_first(self, text: str) -> None:
-        """Show this problem, once it is said, before all that are not urgent."""
+        """Show this problem ahead of those that are not urgent, once it is reported."""
         self._urgent.add(text)
 
     def settle(self, text: str) -> None:
