@@ -16,17 +16,17 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.pipeline import Settings, measure
+from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import Reflections, trace
-from labapp.simulation.pools import Pool
+from labapp.simulation.pools import LowRear, Pool
 from labapp.simulation.render import GreyImage, RenderedFrame, render
 from tests.benchmarks.clutter import KINDS, as_entered, displaced
 from tests.benchmarks.dips import height_error
@@ -43,12 +43,18 @@ PICTURES = ((480, 640), (640, 480), (800, 600), (1280, 1024), (1600, 1200))
 
 @dataclass(frozen=True)
 class Scene:
-    """A frame, its bench as entered, its scale along X′, and its pool."""
+    """A frame, its bench as entered, its pool, and the true rig and view."""
 
     frame: RenderedFrame
     bench: Bench
-    px_per_mm: float
     pool: Pool
+    rig: Rig
+    view: CameraView
+
+    @property
+    def px_per_mm(self) -> float:
+        """Scale along X′."""
+        return float(np.linalg.norm(self.view.px_per_mm[:, 0]))
 
 
 @dataclass(frozen=True)
@@ -110,13 +116,25 @@ def draw_view(rays: Reflections, rng: np.random.Generator) -> CameraView:
     return CameraView(tuple(origin), tuple(x_axis), 60.0, tuple(z_axis), 60.0, width, height)
 
 
+def facing(pool: Pool, rig: Rig) -> Pool:
+    """Return the pool with its head on the side towards which the torch travels."""
+    if rig.head_sign > 0:
+        return pool
+    foot = pool.footprint
+    terms = tuple(
+        replace(term, towards=1) if isinstance(term, LowRear) else term for term in pool.terms
+    )
+    turned = replace(foot, head_mm=foot.tail_mm, tail_mm=foot.head_mm)
+    return replace(pool, footprint=turned, terms=terms)
+
+
 def draw_scene(kind: str, seed: int, off: float = 0.0) -> Scene:
     """Draw benches and pools until enough dots are in the picture; enter the bench with errors."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind), 7])
     while True:
         rig = draw_rig(rng)
         middle = tuple(rng.uniform(-0.5, 0.5, 2))
-        pool = KINDS[kind](rng, rng.uniform(4.0, 7.0), middle)
+        pool = facing(KINDS[kind](rng, rng.uniform(4.0, 7.0), middle), rig)
         rays = trace(pool, rig)
         if rays.visible.sum() < FEWEST:
             continue
@@ -126,15 +144,17 @@ def draw_scene(kind: str, seed: int, off: float = 0.0) -> Scene:
             continue
         axes = (view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm)
         calibration = ImageCalibration.from_three_points(*axes)
-        scale = float(np.linalg.norm(view.px_per_mm[:, 0]))
         entered = as_entered(displaced(rig, rng, off), calibration)
-        return Scene(frame, Bench(entered, calibration), scale, pool)
+        return Scene(frame, Bench(entered, calibration), pool, rig, view)
 
 
-def measured(scene: Scene) -> SceneResult:
-    """Measure a frame as ``labapp reconstruct`` does, and compare with the truth."""
-    image: GreyImage = np.asarray(scene.frame.image, np.uint8)
-    result = measure(image, scene.bench, Settings())[0]
+def image_of(scene: Scene) -> GreyImage:
+    """Return the frame's image."""
+    return np.asarray(scene.frame.image, np.uint8)
+
+
+def compared(scene: Scene, result: Measurement) -> SceneResult:
+    """Compare the measurement of a frame with the truth."""
     if result.match is None or result.measures is None or result.dots is None:
         return SceneResult(result.status, result.reason)
     true_px = np.where(scene.frame.shown[..., None], scene.frame.dot_px, np.nan)
@@ -151,6 +171,23 @@ def measured(scene: Scene) -> SceneResult:
     return SceneResult("ok", "", wrong, len(dots) - wrong, height, sigmas)
 
 
+def summary(kind: str, results: list[SceneResult]) -> str:
+    """Return statuses, error of the height, and error over σ of each size of frames of a kind."""
+    counts = Counter(one.status for one in results).most_common()
+    statuses = ", ".join(f"{count} {status}" for status, count in counts)
+    errors = [[one.sigmas[name] for one in results if one.sigmas] for name in SIZES]
+    rms = ", ".join(
+        f"{name[:-3]} {np.sqrt(np.nanmean(np.square(of_size))):.2f}"
+        for name, of_size in zip(SIZES, errors, strict=True)
+        if np.isfinite(of_size).any()
+    )
+    off_pct = [100 * abs(one.height) for one in results if one.sigmas] or [np.nan]
+    return (
+        f"{kind}: {statuses}; height off by {np.median(off_pct):.2f} % in the median, "
+        f"{max(off_pct):.2f} % at worst; error/σ {rms}"
+    )
+
+
 def main() -> int:
     """Print the results; return the number of frames with a wrong surface."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -164,24 +201,13 @@ def main() -> int:
     for kind in chosen.kinds:
         results = []
         for seed in range(chosen.seed, chosen.seed + chosen.pools):
-            results.append(one := measured(draw_scene(kind, seed, chosen.off)))
+            scene = draw_scene(kind, seed, chosen.off)
+            result = measure(image_of(scene), scene.bench, Settings())[0]
+            results.append(one := compared(scene, result))
             if one.is_wrong or (chosen.refused and one.status != "ok"):
                 print(f"{kind} {seed}: {one}", flush=True)
         wrong += sum(one.is_wrong for one in results)
-        counts = Counter(one.status for one in results).most_common()
-        statuses = ", ".join(f"{count} {status}" for status, count in counts)
-        errors = [[one.sigmas[name] for one in results if one.sigmas] for name in SIZES]
-        rms = ", ".join(
-            f"{name[:-3]} {np.sqrt(np.nanmean(np.square(of_size))):.2f}"
-            for name, of_size in zip(SIZES, errors, strict=True)
-            if np.isfinite(of_size).any()
-        )
-        off_pct = [100 * abs(one.height) for one in results if one.sigmas] or [np.nan]
-        print(
-            f"{kind}: {statuses}; height off by {np.median(off_pct):.2f} % in the median, "
-            f"{max(off_pct):.2f} % at worst; error/σ {rms}",
-            flush=True,
-        )
+        print(summary(kind, results), flush=True)
     return wrong
 
 
