@@ -229,14 +229,18 @@ def _step(one: IntArray, other: IntArray) -> tuple[int, int]:
 
 
 def supported(observed: Observation, best: Hypothesis, fit_settings: FitSettings) -> Hypothesis:
-    """Remove the labels that the surface through the other dots does not support."""
+    """Remove the labels that the surface through the other dots does not support.
+
+    Their rays, which count as dark while the remaining labels are evaluated, do not affect the
+    level of the result.
+    """
     for _ in range(MOST_LEFT_OUT):
         converged = _converged(observed, best, fit_settings)
         wrong = unsupported(observed, fitted_labels(observed, converged, fit_settings))
         if len(wrong) == 0:
             break
         best = _without(observed, best, wrong, fit_settings)
-    return best
+    return _refitted(observed, best, fit_settings)
 
 
 def _without(
@@ -254,13 +258,16 @@ def _without(
 
 def _converged(observed: Observation, best: Hypothesis, fit_settings: FitSettings) -> Hypothesis:
     """Continue the fit of a hypothesis until it has converged as for a reconstruction."""
-    until_settled = replace(fit_settings, settled_mm=FitSettings().settled_mm)
+    return _refitted(observed, best, replace(fit_settings, settled_mm=FitSettings().settled_mm))
+
+
+def _refitted(observed: Observation, best: Hypothesis, fit_settings: FitSettings) -> Hypothesis:
+    """Continue the fit of a hypothesis with its ray states, if that is possible."""
     try:
-        return replace(
-            best, pool=observed.fit(best.labels, best.ray_states, until_settled, best.pool)
-        )
+        pool = observed.fit(best.labels, best.ray_states, fit_settings, best.pool)
     except CannotMeasure:
         return best
+    return replace(best, pool=pool)
 
 
 def fitted_labels(
