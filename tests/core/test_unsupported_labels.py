@@ -11,7 +11,7 @@ from scipy.ndimage import convolve, maximum_filter
 
 from labapp.core.matching import match_kernels, observation
 from labapp.core.matching.checks.unsupported_labels import unsupported
-from labapp.core.matching.decision import fitted_labels
+from labapp.core.matching.decision import fitted_labels, supported
 from labapp.core.matching.hypothesis import USUAL_FIT, evaluate
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import sure_pairs
@@ -299,3 +299,57 @@ def test_a_fit_that_is_kept_takes_little_more_than_its_factor() -> None:
     factors = sum(pool.factor.nbytes for pool in more if pool is not None)
     assert factors > 1e6
     assert after - before < 1.5 * factors
+
+
+def lone_dot() -> tuple[Observation, IntArray, tuple[int, int]]:
+    """Return a scene with a false dot where the innermost lone dark ray would make one.
+
+    The labels include it; none beside it in its row has a dot, and 3 dots lie around it.
+    """
+    observed, labels = scene()
+    hypothesis = evaluate(observed, labels, FIT)
+    assert hypothesis is not None
+    lit = labels != UNLABELLED
+    around = convolve(lit.astype(int), np.ones((3, 3), int), mode="constant")
+    in_row = convolve(lit.astype(int), np.array([[1, 0, 1]]), mode="constant")
+    lone = np.argwhere((hypothesis.ray_states < 0) & (around == 3) & (in_row == 0))
+    height = hypothesis.pool.surface.height_and_gradient(
+        *observed.rays.landing_mm[tuple(lone.T)][:, :2].T
+    )[0]
+    row, column = lone[np.argmax(height)].tolist()
+    predicted = fitted_labels(observed, hypothesis, FIT).paths.plane_mm
+    place = predicted.reshape(*labels.shape, 2)[row, column] + [0.15, 0.1]
+    wrong = labels.copy()
+    wrong[row, column] = len(observed.plane_mm)
+    return with_dot(observed, place), wrong, (row, column)
+
+
+def test_false_dot_beyond_the_last_row_gets_no_ray() -> None:
+    observed, labels, ray = lone_dot()
+    assert left_out(observed, labels) == [labels[ray]]
+
+
+def test_dot_beyond_the_last_row_keeps_its_ray_unless_it_had_none_in_the_previous_frame() -> None:
+    observed, labels = observation_of(see(egg(5.6, 2.5, 3.6, 0.28), np.random.default_rng(1)))
+    hypothesis = evaluate(observed, labels, FIT)
+    assert hypothesis is not None
+    fitted = fitted_labels(observed, hypothesis, FIT)
+    lit, alone = labels != UNLABELLED, (5, 9)
+    assert np.flatnonzero(lit[5]).tolist() == [9]
+    assert unsupported(observed, fitted).tolist() == []
+    assert unsupported(observed, replace(fitted, was_lit=lit)).tolist() == []
+    was_dark = lit.copy()
+    was_dark[alone] = False
+    assert unsupported(observed, replace(fitted, was_lit=was_dark)).tolist() == [labels[alone]]
+
+
+def test_ray_that_loses_its_label_does_not_count_as_dark() -> None:
+    observed, labels = observation_of(see(egg(5.8, 2.4, 3.6, 0.28), np.random.default_rng(0)))
+    before = evaluate(observed, labels, FIT)
+    assert before is not None
+    after = supported(observed, before, FIT)
+    lost = (labels != UNLABELLED) & (after.labels == UNLABELLED)
+    assert lost.any()
+    assert (after.ray_states[lost] == 0).all()
+    # All rays were reflected within the boundary: none contradicts it.
+    assert after.pool.level.negative_log_likelihood < 1.0

@@ -391,6 +391,7 @@ def _unsupported(fit: _Fit, covariance: FloatArray, classes: RayClasses, level: 
         classes=classes,
         floor_mm=fit.settings.floor_mm,
         unsettled_mm=fit.rounds.moved_mm,
+        was_lit=fit.prior.lit,
     )
     return unsupported(fit.observed, fitted)
 
