@@ -3,10 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from PySide6.QtCore import QPoint, Qt
-from PySide6.QtGui import QImage
+from PySide6.QtGui import QColor, QImage, QPalette
+from PySide6.QtWidgets import QToolButton
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.shell.frame_status import FrameStatus, frame_statuses, next_frame
+from labapp.gui.shell.frame_status import TO_CHECK, FrameStatus, frame_statuses, next_frame
 from labapp.gui.shell.window import TICKS
 from labapp.gui.widgets.scrubber import aggregated
 from labapp.gui.widgets.timeline import Timeline
@@ -156,3 +157,30 @@ def test_empty_timeline_is_harmless(qtbot: QtBot):
     assert not timeline.playing
     assert not timeline.isEnabled()
     timeline.grab()
+
+
+def test_buttons_look_usable_once_there_are_frames(qtbot: QtBot):
+    timeline = shown(qtbot, np.zeros(0, np.int64))
+    timeline.take_colours()  # as when the theme is chosen, before a session is open
+    timeline.set_frames(np.arange(3), np.arange(3) / 60, np.zeros(3, np.int64))
+    text = timeline.palette().color(QPalette.ColorGroup.Active, QPalette.ColorRole.ButtonText)
+    for button in timeline.findChildren(QToolButton):
+        if not button.icon().isNull():
+            picture = button.icon().pixmap(button.iconSize()).toImage()
+            assert text.rgb() in colours(picture), button.accessibleName()
+
+
+def colours(picture: QImage) -> set[int]:
+    """The colours of the opaque pixels."""
+    places = [(x, y) for x in range(picture.width()) for y in range(picture.height())]
+    seen = (picture.pixelColor(x, y) for x, y in places)
+    return {QColor(each).rgb() for each in seen if each.alpha() == 255}
+
+
+def test_jumps_name_every_state_that_they_stop_at(qtbot: QtBot):
+    timeline = shown(qtbot, np.zeros(3, np.int64))
+    tips = [button.toolTip() for button in timeline.findChildren(QToolButton)]
+    tips = [tip for tip in tips if "F8)" in tip]
+    assert len(tips) == 2
+    for status in TO_CHECK:
+        assert all(TICKS[status].words.partition(":")[0] in tip for tip in tips)

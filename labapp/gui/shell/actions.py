@@ -205,18 +205,18 @@ FRAMES = (
     ),
     Action(
         "next_doubtful",
-        "Next frame in &doubt",
+        "Next frame &to check",
         "F8",
-        "Go to the next frame that could not be measured, stands out, or is out of date",
+        "Go to the next frame that is in doubt, out of date or could not be measured",
         needs="frames",
         begins=True,
     ),
     Action(
         "previous_doubtful",
-        "Previous frame in d&oubt",
+        "Previous frame t&o check",
         "Shift+F8",
-        "Go to the last frame before this one that could not be measured, stands out, or is out of "
-        "date",
+        "Go to the last frame before this one that is in doubt, out of date or could not be "
+        "measured",
         needs="frames",
     ),
     Action(

@@ -253,7 +253,7 @@ class MainWindow(QMainWindow):
             self.show_step(keys[max(0, min(len(keys) - 1, place))])
 
     def jump(self, kind: str, forward: bool) -> None:
-        """Go to the next or previous frame that is ``doubtful`` or ``corrected``."""
+        """Go to the next or previous frame to check, ``doubtful``, or ``corrected``."""
         session = self.workspace.session
         if session is None:
             return

@@ -34,7 +34,7 @@ class Timeline(FollowsTheme, QWidget):
     moved = Signal(int)
     """The operator went to a frame: its number."""
     jumped = Signal(str, bool)
-    """The operator asked for the next doubtful or corrected frame: ``doubtful`` or ``corrected``,
+    """The operator asked for the next frame to check or corrected: ``doubtful`` or ``corrected``,
     and whether forward.
     """
 
@@ -95,20 +95,25 @@ class Timeline(FollowsTheme, QWidget):
             button.clicked.connect(lambda *_, by=go: self.step(by))
             row.addWidget(button)
         fill(row, self.number, self.position_text)
-        for kind, words, key in (("doubtful", "in doubt", "F8"), ("corrected", "corrected", "F7")):
+        for kind, words, which, key in (
+            ("doubtful", "to check", "that is in doubt, out of date or could not be measured", "F8"),
+            ("corrected", "corrected", "that was corrected by hand", "F7"),
+        ):
+            previous, following = f"previous frame {words}", f"next frame {words}"
             row.addSpacing(8)
-            row.addWidget(self._jump(kind, f"previous frame {words}", "◂", f"Shift+{key}", False))
+            row.addWidget(self._jump(kind, previous, f"{which} (Shift+{key})", False))
             row.addWidget(plain_label(words))
-            row.addWidget(self._jump(kind, f"next frame {words}", "▸", key, True))
+            row.addWidget(self._jump(kind, following, f"{which} ({key})", True))
         row.addSpacing(8)
         row.addWidget(self.counts, 1)
         column = vbox(self.scrubber, row, of=self)
         column.setContentsMargins(6, 4, 6, 4)
         column.setSpacing(4)
 
-    def _jump(self, kind: str, where: str, sign: str, key: str, forward: bool) -> QToolButton:
-        button = self._button(where.capitalize(), f"Go to the {where} ({key})", None)
-        button.setText(sign)
+    def _jump(self, kind: str, name: str, which: str, forward: bool) -> QToolButton:
+        where = "next" if forward else "previous"
+        button = self._button(name.capitalize(), f"Go to the {where} frame {which}", None)
+        button.setText("▸" if forward else "◂")
         button.clicked.connect(lambda: self.jumped.emit(kind, forward))
         return button
 
@@ -123,13 +128,17 @@ class Timeline(FollowsTheme, QWidget):
         return button
 
     def _show_icon(self, button: QToolButton, icon: QStyle.StandardPixmap) -> None:
-        """Show an icon of the style in the colour of button texts: the original icons are black."""
+        """Show an icon of the style in the colour of button texts: the original icons are black.
+
+        The colour is that of a usable button, also before there are frames: Qt greys it itself.
+        """
         self._icons[button] = icon
         ratio = self.devicePixelRatioF()
         pixmap = self.style().standardIcon(icon).pixmap(button.iconSize(), ratio)
         with QPainter(pixmap) as painter:
             painter.setCompositionMode(QPainter.CompositionMode.CompositionMode_SourceIn)
-            painter.fillRect(pixmap.rect(), self.palette().color(QPalette.ColorRole.ButtonText))
+            group, role = QPalette.ColorGroup.Active, QPalette.ColorRole.ButtonText
+            painter.fillRect(pixmap.rect(), self.palette().color(group, role))
         button.setIcon(QIcon(pixmap))
 
     # --- what it shows ----------------------------------------------------------------------
