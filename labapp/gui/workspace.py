@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MEASURING, MISSING, EDITING = "Measuring", "Recording", "Editing"
+MEASURING, MISSING, EDITING, SIZE = "Measuring", "Recording", "Editing", "Frame size"
 """Causes of problems, see `Workspace.say_wrong`."""
 
 MEASURED_S = 0.25
@@ -46,6 +46,8 @@ class Workspace(QObject):
     """Another session is open, or none."""
     changed = Signal()
     """A document, the recording or a result changed; visible pages are updated."""
+    stepped = Signal()
+    """A change was undone or redone; emitted before `changed`."""
     measured = Signal()
     """Frames not in view were measured; emitted a few times per second while more follow."""
     frame_changed = Signal(int)
@@ -76,6 +78,7 @@ class Workspace(QObject):
         # Connected first, so that slots connected later get an up-to-date overview.
         self.opened.connect(self._forget)
         self.changed.connect(self._forget)
+        self.changed.connect(self._settle_size)
         self.tasks = Tasks(self)
         self.tasks.changed.connect(self._show_end)
         self._problems: dict[str, str] = {}
@@ -145,6 +148,25 @@ class Workspace(QObject):
         if words:
             self.settled.emit(words)
 
+    def check_size(self) -> str:
+        """Report a set-up that does not match the size of the frames; return the words, or ""."""
+        words = self._size_warning()
+        if words:
+            self.say_wrong(SIZE, words)
+        return words
+
+    def _size_warning(self) -> str:
+        from labapp.session.frame_size import size_warning
+
+        session = self.session
+        if session is None or session.recording is None:
+            return ""
+        return size_warning(session, session.recording)
+
+    def _settle_size(self) -> None:
+        if SIZE in self._problems and not self._size_warning():
+            self.settle(SIZE)
+
     def run_or_report(
         self, work: Callable[[], T], cause: str = "", beside: Callable[[str], object] | None = None
     ) -> T | None:
@@ -211,7 +233,10 @@ class Workspace(QObject):
             frames = [frame for _, frame in step.keys if frame >= 0]
             if frames and self.frame not in frames:
                 self.show_frame(frames[0])
+            self.stepped.emit()
             self.changed.emit()
+            if any(name == "setup" for name, _ in step.keys):
+                self.check_size()
 
     def overview(self) -> Overview | None:
         """Overview of all frames, read once after each change; None without a session.

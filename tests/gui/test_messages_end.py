@@ -144,6 +144,42 @@ def test_incomplete_setup_message_ends_after_measuring(opened: MainWindow, tmp_p
     opened.files.close()  # the duration of measuring does not matter here
 
 
+def test_undo_ends_what_was_said_about_a_loaded_setup(
+    window: MainWindow, copy_sample: CopySample, tmp_path: Path
+):
+    assert window.files.open(copy_sample("concave"))
+    larger = copy_sample("gtaw").parent / "setup.toml"
+    window.show_step("setup")
+    page = window.page
+    page.take(larger)
+    assert page.answer.text().startswith("▲")
+    assert len(window.status_line.unread) == 1
+    window.do("undo")
+    assert page.answer.text() == ""
+    assert window.status_line.unread == []
+    window.do("redo")
+    assert len(window.status_line.unread) == 1
+    fitting = window.workspace.session.path.parent / "setup.toml"
+    assert window.workspace.attempt(lambda session: session.set_setup(fitting.read_text("utf-8")))
+    assert window.status_line.unread == []
+
+
+def test_measuring_is_not_reported_for_another_scheme(opened: MainWindow, qtbot: QtBot):
+    opened.show_step("surface")
+    page = opened.page
+    page.side.this_one()
+    qtbot.waitUntil(lambda: page.answer.text().startswith("✓"))
+    page.side.scheme.edited.emit("zonal")
+    qtbot.waitUntil(lambda: opened.stack.currentWidget() is opened.empty)
+    assert page.answer.text() == ""
+    opened.do("measure_frame")
+    qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
+    assert opened.stack.currentWidget() is page
+    page.side.scheme.edited.emit("modal")
+    qtbot.waitUntil(lambda: opened.stack.currentWidget() is opened.empty)
+    assert opened.empty.answer.text() == ""
+
+
 def test_rejected_files_are_reported_beside_their_buttons(
     opened: MainWindow, tmp_path: Path, qtbot: QtBot
 ):

@@ -10,16 +10,13 @@ from typing import Any
 
 from PySide6.QtCore import QObject, Signal
 
-from labapp.config.setup_text import frame_px_of, three_points
 from labapp.errors import InputError
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import selectable_label, show_words
 from labapp.gui.widgets.layouts import row_of
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
-from labapp.session.calibrations import calibrations_in_use
-from labapp.session.record import Recording
-from labapp.session.session import Session
+from labapp.session.frame_size import other_size
 
 NUMBERS = {
     "exposure_us": ("Exposure", "µs", 1, 100.0, "How long each frame is exposed"),
@@ -236,45 +233,3 @@ def setting_text(value: object) -> str:
     if isinstance(value, str):
         return f"“{TRIGGERS.get(value, value)}”"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def calibrated_px(session: Session) -> tuple[int, int] | None:
-    """(rows, columns) of the picture used to calibrate the imaging plane; None if unknown.
-
-    Sessions of earlier versions have it in the stored picture only.
-    """
-    if size := frame_px_of(session.setup_text):
-        return size[1], size[0]
-    kept = session.plane_calibration
-    if kept is None or not calibrations_in_use(session)[1]:
-        return None
-    try:
-        rows, columns = session.picture(kept.picture_sha256).shape
-    except InputError:
-        return None
-    return rows, columns
-
-
-def size_warning(session: Session, recording: Recording) -> str:
-    """Warning if a set-up does not match the size of the frames, else ""."""
-    shape, calibrated = (recording.rows, recording.columns), calibrated_px(session)
-    points = three_points(session.setup_text)
-    if calibrated is None and points is not None and (points > shape[::-1]).any():
-        u, v = points.max(axis=0)
-        return (
-            f"The set-up's image calibration has points up to ({u:.0f}, {v:.0f}) px, and frames "
-            f"have {recording.columns}×{recording.rows} px: was it made with larger pictures? "
-            "Calibrate with a picture of the same size"
-        )
-    return other_size(calibrated, shape)
-
-
-def other_size(calibrated: tuple[int, int] | None, shape: tuple[int, int]) -> str:
-    """Warning if frames of shape (rows, columns) differ from the calibration picture, else ""."""
-    if calibrated is None or calibrated == shape:
-        return ""
-    (rows, columns), (height, width) = calibrated, shape
-    return (
-        f"The imaging plane was calibrated with a picture of {columns}×{rows} px, and frames have "
-        f"{width}×{height} px: sizes are wrong. Calibrate with a picture of the same region"
-    )

@@ -9,7 +9,7 @@ from functools import partial
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 
 from labapp.core.pipeline import Settings
-from labapp.gui.live.camera_fields import CameraFields, calibrated_px
+from labapp.gui.live.camera_fields import CameraFields
 from labapp.gui.live.canvas import LiveCanvas
 from labapp.gui.live.figures import (
     OLD_S,
@@ -46,6 +46,7 @@ from labapp.media.recording.recorder import recording_path
 from labapp.media.recording.take_files import Take
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_watch import LiveWatch
+from labapp.session.frame_size import calibrated_px
 from labapp.session.session import Session
 from labapp.simulated.simulated_pool import pool_camera, simulated_pool
 from labapp.text import pluralize

@@ -51,6 +51,7 @@ class Page(QWidget):
         self._changing: list[QWidget] = []
         self._latest: dict[str, tuple[Task, object]] = {}
         workspace.opened.connect(self._take_session)
+        workspace.stepped.connect(self._clear_answers)
 
     @property
     def session(self) -> Session:
@@ -125,7 +126,9 @@ class Page(QWidget):
     def change_when_edited(self, field: Field, change: Callable[[Session, Any], object]) -> None:
         """Change the session by a function of it and the new value when a field is edited."""
         field.edited.connect(
-            lambda value: self.workspace.attempt(lambda session: change(session, value))
+            lambda value: self.workspace.attempt(
+                lambda session: change(session, value), beside=self.answer.setText
+            )
         )
 
     def lock_with_session(self, *widgets: QWidget) -> None:
@@ -143,12 +146,16 @@ class Page(QWidget):
 
     def _take_session(self) -> None:
         """Clear messages about the previous session."""
-        for message in self._answers:
-            message.setText("")
+        self._clear_answers()
         for side in (self, self.panel):
             for field in side.findChildren(Field):
                 field.refuse("")
         self._lock()
+
+    def _clear_answers(self) -> None:
+        """Clear the outcomes of buttons, which do not hold for another state of the session."""
+        for message in self._answers:
+            message.setText("")
 
     def refresh(self) -> None:
         """Show the current contents of the session; ``workspace.session`` is not None."""

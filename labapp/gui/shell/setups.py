@@ -82,8 +82,6 @@ class Setups(QObject):
 
     def _use(self, take: Callable[[Session], None], name: str) -> None:
         """Use a set-up, and measure with it unless it was calibrated for another frame size."""
-        from labapp.gui.live.camera_fields import size_warning
-
         workspace = self.workspace
         if not workspace.attempt(take, CAUSE, self.answered.emit):
             return
@@ -92,11 +90,9 @@ class Setups(QObject):
         words = f"Set-up of {name} applied; undo restores the former one"
         workspace.notified.emit(words, False)
         self.answered.emit(f"{DONE} {words}")
-        recording = session.recording
-        if recording is None or session.missing_recording is not None:
+        if session.recording is None or session.missing_recording is not None:
             return
-        if unlike := size_warning(session, recording):
-            workspace.say_wrong(CAUSE, unlike)
+        if unlike := workspace.check_size():
             self.answered.emit(f"{PROBLEM} {unlike}")
             return
         workspace.measure(beside=self.answered.emit)

@@ -390,6 +390,8 @@ class MainWindow(QMainWindow):
         if found is not None:
             self.empty.show_lead(page.key, found)
             self.empty.setAccessibleName(step.title)
+        else:
+            self.empty.answer.setText("")
         show_in(self.stack, page if found is None else self.empty)
 
     def _frame_changed(self, frame: int) -> None:

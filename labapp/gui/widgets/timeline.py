@@ -96,7 +96,7 @@ class Timeline(FollowsTheme, QWidget):
             row.addWidget(button)
         fill(row, self.number, self.position_text)
         for kind, words, which, key in (
-            ("doubtful", "to check", "that is in doubt, out of date or could not be measured", "F8"),
+            ("doubtful", "to check", "in doubt, out of date, or that could not be measured", "F8"),
             ("corrected", "corrected", "that was corrected by hand", "F7"),
         ):
             previous, following = f"previous frame {words}", f"next frame {words}"

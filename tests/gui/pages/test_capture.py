@@ -18,7 +18,6 @@ from labapp.core.images.exposure import judge_exposure
 from labapp.core.images.find_dots import DotSettings
 from labapp.errors import InputError
 from labapp.gui import dialogs
-from labapp.gui.live.camera_fields import calibrated_px, other_size
 from labapp.gui.pages.capture import page as capture_page_module
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.pages.capture.presenter import (
@@ -35,6 +34,7 @@ from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.exposure import BARS, bars
 from labapp.gui.workspace import Workspace
 from labapp.session.copies import next_session
+from labapp.session.frame_size import calibrated_px, other_size
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.text import format_bytes

@@ -10,7 +10,6 @@ from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import QGridLayout, QSlider
 
 from labapp.gui.dialogs import ask_file, ask_folder, ask_recording
-from labapp.gui.live.camera_fields import size_warning
 from labapp.gui.live.view import LiveView
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
 from labapp.gui.pages.capture.import_choice import ImportChoice
@@ -34,6 +33,7 @@ from labapp.gui.widgets.labels import keep_room, plain_label, selectable_label, 
 from labapp.gui.widgets.layouts import Group, fill, hbox
 from labapp.gui.workspace import MISSING, Workspace
 from labapp.media.recording.take_files import Take
+from labapp.session.frame_size import size_warning
 from labapp.session.record import Recording
 from labapp.session.session import Session
 from labapp.text import pluralize

@@ -146,16 +146,8 @@ class SetupPage(Page):
             lambda session: load_setup(session, path), "Loading", self.answer.setText
         ):
             self.confirm(f"Set-up loaded from {path.name}")
-            self._warn_of_size()
-
-    def _warn_of_size(self) -> None:
-        """Report a set-up that does not match the size of the frames."""
-        from labapp.gui.live.camera_fields import size_warning
-
-        recording = self.session.recording
-        if recording is not None and (unlike := size_warning(self.session, recording)):
-            self.workspace.say_wrong("Loading", unlike)
-            self.answer.setText(f"{PROBLEM} {unlike}")
+            if unlike := self.workspace.check_size():
+                self.answer.setText(f"{PROBLEM} {unlike}")
 
     def take(self, path: Path, at_once: bool = False) -> None:
         """Load the setup from a dropped file, in the tab that shows it."""

@@ -167,7 +167,8 @@ class SurfacePanel:
         self.workspace.attempt(
             lambda session: session.set_settings(
                 with_scheme(session.settings, name), f"scheme {SCHEMES[name].title}"
-            )
+            ),
+            beside=self._answer.setText,
         )
 
     def _choose_correspondence(self, choice: str) -> None:
@@ -175,5 +176,6 @@ class SurfacePanel:
             lambda session: session.set_settings(
                 replace(session.settings, correspondence=choice),  # type: ignore[arg-type]
                 f"correspondence {choice}",
-            )
+            ),
+            beside=self._answer.setText,
         )
