@@ -196,25 +196,26 @@ class NumberField(Field):
 
     def _read(self, text: str) -> tuple[float | None, str]:
         """Value of a text, and its problem."""
-        kept = self._shown(self._value) or "nothing"
+        shown = self._shown(self._value)
+        kept = f"{shown} stays" if shown else "the field stays empty"
         if not text.strip():
-            return None, "" if self.optional else f"A number is needed; {kept} stays"
+            return None, "" if self.optional else f"A number is needed; {kept}"
         if self.decimals == 0 and not {".", ","}.isdisjoint(text):  # they may separate thousands
-            return None, f"“{text.strip()}” is not a whole number in digits only; {kept} stays"
+            return None, f"“{text.strip()}” is not a whole number in digits only; {kept}"
         value = parsed(text)
         if value is None:
-            return None, f"“{text.strip()}” is not a number; {kept} stays"
+            return None, f"“{text.strip()}” is not a number; {kept}"
         other = with_thousands(text)
         if other is not None:
             words = f"“{text.strip()}” can be {value:.7g} or {other:.7g}: write it without a comma"
-            return None, f"{words}; {kept} stays"
+            return None, f"{words}; {kept}"
         if not self.lowest <= value <= self.highest:
             low, high = (entered(end, 0) for end in (self.lowest, self.highest))
             words = f"from {low} to {high} {self.unit.text()}".strip()
-            return None, f"“{text.strip()}” is not {words}; {kept} stays"
+            return None, f"“{text.strip()}” is not {words}; {kept}"
         if self.decimals == 0:
             if value != int(value):
-                return None, f"“{text.strip()}” is not a whole number; {kept} stays"
+                return None, f"“{text.strip()}” is not a whole number; {kept}"
             return int(value), ""
         return value, ""
 

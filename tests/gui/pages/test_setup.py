@@ -237,6 +237,12 @@ def test_dot_pattern_can_be_chosen(page: SetupPage) -> None:
     assert len(session.setup.rig.pattern.measured) == len(GRID)
 
 
+def test_every_field_has_a_name_of_its_own(page: SetupPage) -> None:
+    fields = [*page.rig_fields.values(), *page.sigma_fields.values(), *page.record_fields.values()]
+    names = [field.editor.accessibleName() for field in fields]
+    assert len(set(names)) == len(names)
+
+
 def test_problem_of_a_field_stays_while_others_are_accepted(
     qtbot: QtBot, page: SetupPage, copy_sample: Callable[[str], Path]
 ) -> None:

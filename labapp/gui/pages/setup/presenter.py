@@ -68,7 +68,7 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
         Entry("laser.projection_angle_deg", "Projection angle", "°",
               "Elevation of the beam above the work piece; step Laser measures it",
               0, 90, 0.5, 2, 30),
-        Entry("laser.distance_mm", "Distance", "mm",
+        Entry("laser.distance_mm", "Laser distance", "mm",
               "From the diode to the work piece under the electrode; step Laser measures it",
               0, 10_000, 0.5, 2, 35),
         Entry("laser.azimuth_deg", "Azimuth", "°",
@@ -86,16 +86,16 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
               "From the work piece up to the electrode's tip", 0, 10_000, 0.5, 2, 4),
     )),
     ("Imaging plane", (
-        Entry("imaging_plane.distance_mm", "Distance", "mm",
+        Entry("imaging_plane.distance_mm", "Plane distance", "mm",
               "From the electrode's axis back to O′, along −Y", 0, 10_000, 1, 2, 50),
         Entry("imaging_plane.s_mm", "s, to the left", "mm",
               "How far O′ lies to the left of the electrode, as the camera sees it",
               -10_000, 10_000, 1, 2),
         Entry("imaging_plane.h_mm", "h, above", "mm",
               "How high O′ lies above the work piece", -10_000, 10_000, 0.5, 2),
-        Entry("imaging_plane.width_mm", "Width", "mm",
+        Entry("imaging_plane.width_mm", "Plane width", "mm",
               "Size along O′X′, from O′", 0, 10_000, 1, 1, 101.6),
-        Entry("imaging_plane.height_mm", "Height", "mm",
+        Entry("imaging_plane.height_mm", "Plane height", "mm",
               "Size along O′Z′, from O′", 0, 10_000, 1, 1, 101.6),
         Entry("imaging_plane.pitch_deg", "Pitch", "°",
               "How far its upper edge leans away from the torch; empty: upright", -90, 90, 0.5, 2),
@@ -160,11 +160,12 @@ def sigma_entry(entry: Entry) -> Entry | None:
     if key not in ASSUMED:
         return None
     least = 10.0 ** -max(entry.decimals, 3)
+    usual = f"{ASSUMED[key]:g} {entry.unit}".rstrip()
     return Entry(
         key,
         f"{entry.label} ±",
         entry.unit,
-        f"Standard uncertainty of “{entry.label}”; empty: {ASSUMED[key]:g} {entry.unit} is assumed",
+        f"Standard uncertainty of “{entry.label}”; empty: {usual} is assumed",
         0,
         90 if entry.unit == "°" else 10_000,
         max(entry.step / 10, least),
@@ -173,9 +174,11 @@ def sigma_entry(entry: Entry) -> Entry | None:
 
 
 POOL = (
-    Entry("expected_width_mm", "Width", "mm", "Of the pool that is expected", 0.1, 100, 0.5, 2),
-    Entry("expected_length_mm", "Length", "mm", "Of the pool that is expected", 0.1, 100, 0.5, 2),
-    Entry("expected_height_mm", "Height", "mm",
+    Entry("expected_width_mm", "Pool width", "mm",
+          "Of the pool that is expected", 0.1, 100, 0.5, 2),
+    Entry("expected_length_mm", "Pool length", "mm",
+          "Of the pool that is expected", 0.1, 100, 0.5, 2),
+    Entry("expected_height_mm", "Pool height", "mm",
           "Of the pool that is expected; negative for a concave one", -50, 50, 0.05, 2),
 )  # fmt: skip
 
