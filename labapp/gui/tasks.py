@@ -19,6 +19,7 @@ from PySide6.QtCore import QObject, QTimer, Signal
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.log import NAME
+from labapp.text import capitalized
 
 POLL_MS = 10
 
@@ -206,7 +207,7 @@ class Tasks(QObject):
         if kind == "failed":
             self.failed.emit(task.title, value, task.kind)
             if task.beside is not None:
-                task.beside(f"{PROBLEM} {value}")
+                task.beside(f"{PROBLEM} {capitalized(value)}")
         elif kind == "done" and task.on_done is not None:
             task.on_done(value)
         self.changed.emit()

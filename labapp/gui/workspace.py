@@ -17,7 +17,7 @@ from labapp.gui.drafts import folder_of
 from labapp.gui.tasks import DONE, PROBLEM, Control, Task, Tasks, error_text
 from labapp.session.results.statuses import is_failed
 from labapp.simulation import parallel
-from labapp.text import pluralize
+from labapp.text import capitalized, pluralize
 
 if TYPE_CHECKING:
     from labapp.gui.foot_switches import FootSwitches
@@ -182,7 +182,7 @@ class Workspace(QObject):
         try:
             done = work()
         except Exception as error:
-            words = error_text(error)
+            words = capitalized(error_text(error))
             if cause:
                 self.say_wrong(cause, words)
             else:
@@ -343,9 +343,9 @@ class Workspace(QObject):
 
 
 def measured_text(done: int, failed: int, stale: int) -> str:
-    """Text of the numbers of frames measured, without a surface, and out of date at the end."""
-    words = f"{pluralize(done, 'frame')} measured"
-    words += f", {failed} without a surface" if failed else ""
+    """Text of how many of the frames done have a surface, have none, and are out of date."""
+    words = f"{pluralize(done - failed, 'frame')} measured"
+    words += f", {failed} could not be" if failed else ""
     if stale:
         words += f", {stale} already out of date by a change meanwhile: measure again (F5)"
     return words

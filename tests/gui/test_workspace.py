@@ -83,6 +83,25 @@ def test_frames_out_of_date_by_a_change_while_measuring_are_reported(
     workspace.close()
 
 
+def test_frames_without_a_surface_do_not_count_as_measured():
+    assert measured_text(3, 0, 0).startswith("3 frames")
+    assert measured_text(3, 2, 0).startswith("1 frame ")
+
+
+def test_reason_of_a_refused_change_begins_with_a_capital_letter(
+    qapp: QApplication, state: object, copy_sample: CopySample, qtbot: QtBot
+) -> None:
+    def refuse(_: Session) -> None:
+        raise ValueError("rows cross")
+
+    workspace = Workspace()
+    workspace.show(Session.open(copy_sample("thumb_tack")))
+    with qtbot.waitSignal(workspace.notified) as told:
+        assert not workspace.attempt(refuse)
+    assert told.args[0] == "Rows cross"
+    workspace.close()
+
+
 def test_measuring_cancelled_by_another_session_is_no_fault(
     qapp: QApplication, state: object, copy_sample: CopySample, qtbot: QtBot,
     monkeypatch: pytest.MonkeyPatch,
