@@ -90,6 +90,8 @@ class Task:
     """Tasks of the same kind share a failure: "Exporting" for any folder."""
     is_lasting: bool
     """Whether it continues when another session is opened."""
+    asked_to_stop: bool = False
+    """Whether the operator cancelled it, and is told when it has stopped."""
 
     @property
     def done(self) -> int:
@@ -105,6 +107,11 @@ class Task:
         """Request the work to stop; finished parts are kept."""
         self.control.cancelled.set()
 
+    def stop(self) -> None:
+        """Cancel it for the operator."""
+        self.asked_to_stop = True
+        self.cancel()
+
 
 class Tasks(QObject):
     """The tasks of a window."""
@@ -115,6 +122,8 @@ class Tasks(QObject):
     """The progress of a task changed."""
     failed = Signal(str, str, str)
     """A task failed: its title, the message for the operator, and its kind."""
+    stopped = Signal(str)
+    """A task that the operator cancelled has stopped: its title."""
     settled = Signal(str)
     """Work of a kind begins again: an earlier failure no longer counts."""
 
@@ -210,6 +219,8 @@ class Tasks(QObject):
                 task.beside(f"{PROBLEM} {capitalized(value)}")
         elif kind == "done" and task.on_done is not None:
             task.on_done(value)
+        elif kind == "cancelled" and task.asked_to_stop:
+            self.stopped.emit(task.title)
         self.changed.emit()
 
 

@@ -76,6 +76,20 @@ def test_cancelling_stops_the_task_without_a_callback(qtbot: QtBot):
     assert not line.bar.isVisibleTo(line)
 
 
+def test_only_what_the_operator_cancelled_is_said_to_be_so(qtbot: QtBot):
+    tasks = Tasks()
+    line = StatusLine(tasks)
+    qtbot.addWidget(line)
+    line.say("The table is on the clipboard", False)
+    tasks.start("Drawing", endless).cancel()
+    qtbot.waitUntil(lambda: not tasks.active)
+    assert line.message.text() == "The table is on the clipboard"
+    tasks.start("Measuring", endless)
+    line.cancel()
+    qtbot.waitUntil(lambda: not tasks.active)
+    assert line.message.text().startswith("Measuring")
+
+
 def test_cancel_all_waits_for_the_tasks(qtbot: QtBot):
     tasks = Tasks()
     started = [tasks.start(name, endless) for name in ("Measuring", "Importing")]

@@ -114,6 +114,7 @@ class StatusLine(QWidget):
         self.setMinimumHeight(layout.sizeHint().height())
         tasks.changed.connect(self.show_progress)
         tasks.progressed.connect(self.show_progress)
+        tasks.stopped.connect(lambda title: self.say(f"{title}: cancelled", False))
         self.show_progress()
         self._show_message("")
 
@@ -146,7 +147,7 @@ class StatusLine(QWidget):
     def cancel(self) -> None:
         """Request all current work to stop."""
         for task in self._tasks.active:
-            task.cancel()
+            task.stop()
         self.show_progress()
 
     def show_progress(self) -> None:

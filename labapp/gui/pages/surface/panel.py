@@ -161,7 +161,7 @@ class SurfacePanel:
     def stop(self) -> None:
         """Stop measuring."""
         if self.workspace.measuring is not None:
-            self.workspace.measuring.cancel()
+            self.workspace.measuring.stop()
 
     def _choose_scheme(self, name: str) -> None:
         self.workspace.attempt(
