@@ -60,6 +60,9 @@ SLOW_MS = 300
 STATUS_S = 0.2
 """Minimum interval of updates of the figures."""
 
+CONNECTION = "Camera"
+"""Cause of the problem that a camera sends no frames, see `Workspace.say_wrong`."""
+
 NO_LINES = "The simulated camera shows dots, and this session is of lines: choose another camera"
 
 
@@ -254,6 +257,7 @@ class LiveView(QObject):
         def done(_: object) -> None:
             self._ending.remove(live)
             self._report_events(live)
+            self.workspace.settle(CONNECTION)
 
         self.workspace.tasks.start(title, lambda _: live.close(), done)
         self._show_state()
@@ -353,6 +357,8 @@ class LiveView(QObject):
         if time.monotonic() - self._status_s > STATUS_S:
             self._show_status(live)
         self._report_events(live)
+        if live.feed is not None and live.feed.state == "running":
+            self.workspace.settle(CONNECTION)
         self.camera_fields.take_answers()
         took_ms = (time.perf_counter() - began_s) * 1000
         wanted = min(max(TICK_MS, round(2 * took_ms)), SLOW_MS)
@@ -391,6 +397,9 @@ class LiveView(QObject):
 
     def _report(self, event: Event, live: Live) -> None:
         """Report an event; lost frames are a problem only while they are recorded."""
+        if event.kind == "warning" and event.source == live.name:
+            self.workspace.say_wrong(CONNECTION, str(event))
+            return
         recorded = live.running is not None or event.source != live.name
         problem = event.kind == "warning" or (event.kind == "loss" and recorded)
         if problem and event.kind == "loss":
