@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from PySide6.QtCore import QPoint, Qt
-from PySide6.QtGui import QColor, QImage, QPalette
+from PySide6.QtGui import QColor, QIcon, QImage, QPalette
 from PySide6.QtWidgets import QToolButton
 from pytestqt.qtbot import QtBot
 
@@ -159,15 +159,17 @@ def test_empty_timeline_is_harmless(qtbot: QtBot):
     timeline.grab()
 
 
-def test_buttons_look_usable_once_there_are_frames(qtbot: QtBot):
+def test_buttons_look_usable_only_while_there_are_frames(qtbot: QtBot):
     timeline = shown(qtbot, np.zeros(0, np.int64))
     timeline.take_colours()  # as when the theme is chosen, before a session is open
     timeline.set_frames(np.arange(3), np.arange(3) / 60, np.zeros(3, np.int64))
-    text = timeline.palette().color(QPalette.ColorGroup.Active, QPalette.ColorRole.ButtonText)
-    for button in timeline.findChildren(QToolButton):
-        if not button.icon().isNull():
-            picture = button.icon().pixmap(button.iconSize()).toImage()
-            assert text.rgb() in colours(picture), button.accessibleName()
+    text, icons, groups = QPalette.ColorRole.ButtonText, QIcon.Mode, QPalette.ColorGroup
+    for mode, group in ((icons.Normal, groups.Active), (icons.Disabled, groups.Disabled)):
+        wanted = timeline.palette().color(group, text)
+        for button in timeline.findChildren(QToolButton):
+            if not button.icon().isNull():
+                picture = button.icon().pixmap(button.iconSize(), mode).toImage()
+                assert wanted.rgb() in colours(picture), button.accessibleName()
 
 
 def colours(picture: QImage) -> set[int]:

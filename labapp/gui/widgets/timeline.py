@@ -128,18 +128,20 @@ class Timeline(FollowsTheme, QWidget):
         return button
 
     def _show_icon(self, button: QToolButton, icon: QStyle.StandardPixmap) -> None:
-        """Show an icon of the style in the colour of button texts: the original icons are black.
-
-        The colour is that of a usable button, also before there are frames: Qt greys it itself.
-        """
+        """Show an icon of the style in the colour of button texts: the original icons are black."""
         self._icons[button] = icon
-        ratio = self.devicePixelRatioF()
-        pixmap = self.style().standardIcon(icon).pixmap(button.iconSize(), ratio)
-        with QPainter(pixmap) as painter:
-            painter.setCompositionMode(QPainter.CompositionMode.CompositionMode_SourceIn)
-            group, role = QPalette.ColorGroup.Active, QPalette.ColorRole.ButtonText
-            painter.fillRect(pixmap.rect(), self.palette().color(group, role))
-        button.setIcon(QIcon(pixmap))
+        ratio, shown = self.devicePixelRatioF(), QIcon()
+        for mode, group in (
+            (QIcon.Mode.Normal, QPalette.ColorGroup.Active),
+            (QIcon.Mode.Disabled, QPalette.ColorGroup.Disabled),
+        ):
+            pixmap = self.style().standardIcon(icon).pixmap(button.iconSize(), ratio)
+            with QPainter(pixmap) as painter:
+                painter.setCompositionMode(QPainter.CompositionMode.CompositionMode_SourceIn)
+                colour = self.palette().color(group, QPalette.ColorRole.ButtonText)
+                painter.fillRect(pixmap.rect(), colour)
+            shown.addPixmap(pixmap, mode)
+        button.setIcon(shown)
 
     # --- what it shows ----------------------------------------------------------------------
 
