@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PySide6.QtCore import QPoint, QPointF, Qt
-from PySide6.QtGui import QFontMetricsF, QGuiApplication
+from PySide6.QtGui import QFontMetricsF, QGuiApplication, QPainter, QPixmap
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.curves import Axis, Curve, Mark, as_table, nearest, next_key, point_text
 from labapp.gui.theme import palette
-from labapp.gui.views.axes import PlainAxis
+from labapp.gui.views.axes import PlainAxis, make_plot
 from labapp.gui.views.plots import MOST_POINTS, PlotStack
 from tests.gui.conftest import KEPT, let_draw
 
@@ -247,3 +247,19 @@ def test_numbers_of_a_short_axis_do_not_overlap(
     line_px = QFontMetricsF(QGuiApplication.font()).height()
     assert spacing / (high - low) * length_px >= line_px
     assert spacing <= high - low
+
+
+def test_numbers_of_an_axis_are_not_cut_off_at_its_ends(qtbot: QtBot):
+    plot = make_plot("along (mm)", "height (mm)", equal=False)
+    qtbot.addWidget(plot)
+    plot.setYRange(0.0, 0.3, padding=0)
+    plot.resize(300, 200)
+    with qtbot.waitExposed(plot):
+        plot.show()
+    for side in ("left", "bottom"):
+        axis, picture = plot.getAxis(side), QPixmap(10, 10)
+        with QPainter(picture) as painter:
+            numbers = axis.generateDrawSpecs(painter)[2]
+        room = axis.mapRectFromParent(axis.geometry()).adjusted(-1, -1, 1, 1)
+        assert len(numbers) > 1
+        assert all(room.contains(rect) for rect, _, _ in numbers)

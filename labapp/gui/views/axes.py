@@ -21,8 +21,12 @@ class PlainAxis(pg.AxisItem):  # type: ignore[misc]
 
     pyqtgraph scales them by the visible range whenever a label is set, even if scaling is switched
     off: the numbers of an axis in mm would be in µm, but its label would still say mm. Along a
-    short vertical axis it draws four numbers whatever their height.
+    short vertical axis it draws four numbers whatever their height, and cuts them off at its ends.
     """
+
+    def __init__(self, side: str) -> None:
+        super().__init__(side)
+        self.setStyle(hideOverlappingLabels=True)
 
     def tickSpacing(self, low: float, high: float, length_px: float) -> list[tuple[float, float]]:
         """Spacings of ticks, widest first, and their offsets: as wide as a line of text."""
