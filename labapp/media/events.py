@@ -25,6 +25,8 @@ class Event:
     kind: Kind
     words: str
     """One sentence for the operator."""
+    passes: bool = False
+    """Whether it is over when the camera sends frames again."""
 
     def __str__(self) -> str:
         return f"{self.source}: {self.words}"

@@ -397,7 +397,7 @@ class LiveView(QObject):
 
     def _report(self, event: Event, live: Live) -> None:
         """Report an event; lost frames are a problem only while they are recorded."""
-        if event.kind == "warning" and event.source == live.name:
+        if event.passes:
             self.workspace.say_wrong(CONNECTION, str(event))
             return
         recorded = live.running is not None or event.source != live.name

@@ -171,8 +171,8 @@ class Feed:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _emit(self, kind: Kind, words: str) -> None:
-        self._on_event(Event(self.name, kind, words))
+    def _emit(self, kind: Kind, words: str, passes: bool = False) -> None:
+        self._on_event(Event(self.name, kind, words, passes))
 
     def _open(self) -> Camera:
         camera = self._opener()
@@ -194,7 +194,7 @@ class Feed:
                     self._emit_set()
                     self._lost += 1
                     self.state = "lost"
-                    self._emit("warning", f"{error}. Trying to get it back")
+                    self._emit("warning", f"{error}. Trying to get it back", passes=True)
                     self._reopen()
         except Exception as error:
             logging.getLogger("labapp").exception("feed of %s", self.name)
@@ -283,7 +283,8 @@ class Feed:
             raise CameraLost(f"no frame came for {silent_s:.0f} s")
         if silent_s > longest_s and self.state == "running":
             self.state = "stalled"
-            self._emit("warning", f"no frame came for {silent_s:.1f} s; it is still connected")
+            words = f"no frame came for {silent_s:.1f} s; it is still connected"
+            self._emit("warning", words, passes=True)
 
     def _deliver(self, frame: CameraFrame) -> None:
         known = self._connection
@@ -336,7 +337,7 @@ class Feed:
             except (CameraError, InputError) as error:
                 if str(error) not in reported:
                     reported.add(str(error))
-                    self._emit("warning", str(error))
+                    self._emit("warning", str(error), passes=True)
                 continue
             while self._triggers.acquire(blocking=False):
                 pass  # outdated triggers
