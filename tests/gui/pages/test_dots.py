@@ -25,7 +25,7 @@ from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.fitting import Processes, Refit
 from labapp.gui.pages.dots.page import DotsPage
 from labapp.gui.shell.window import MainWindow
-from labapp.gui.tasks import Cancelled, Control
+from labapp.gui.tasks import PROBLEM, Cancelled, Control
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT, let_draw
@@ -440,6 +440,9 @@ def test_rejected_edit_is_reported_and_changes_nothing(
     assert "already assigned" in messages[-1][0]
     assert len(session.history) == steps
     assert unfitted == []
+    assert page.dots_panel.chosen.text() == f"{PROBLEM} {messages[-1][0]}"
+    key(page, Qt.Key.Key_Period)
+    assert PROBLEM not in page.dots_panel.chosen.text()
 
 
 def test_nothing_to_discard_is_a_note_not_a_problem(

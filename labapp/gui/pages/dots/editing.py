@@ -38,6 +38,8 @@ class Editor:
         """Indices of the selected dots, ascending."""
         self.shift_px: FloatArray = np.zeros(2)
         """Displacement of the selected dots by a drag or held key in progress, shape (2,), px."""
+        self.refusal = ""
+        """Why the last edit of these dots was refused; empty if it was made."""
 
     def show(self, correction: Correction | None, same_frame: bool) -> None:
         """Show a correction; the selection is kept for the same frame unless dots were removed."""
@@ -45,7 +47,7 @@ class Editor:
         self.correction = correction
         stays = same_frame and before is not None and correction is not None
         if not stays or before is None or correction is None:
-            self.selection, self.shift_px = NOTHING, np.zeros(2)
+            self.selection, self.shift_px, self.refusal = NOTHING, np.zeros(2), ""
         elif len(before.dots) != len(correction.dots):
             self.selection = self.selection[self.selection < len(correction.dots)]
             if len(before.dots) > len(correction.dots):

@@ -225,7 +225,7 @@ class DotsPage(Page):
         elif len(editor.rows) == 1:
             site = editor.rows[0], 0
         chosen = presenter.chosen_words(editor.correction, editor.selection.tolist())
-        words = self.dot_tool.asked or chosen
+        words = self.dot_tool.asked or editor.refusal or chosen
         is_new = words != self.dots_panel.chosen.text()
         self.dots_panel.show_chosen(words, editor.rows, site)
         if is_new and editor.selection.size and self.view.hasFocus():
@@ -248,6 +248,7 @@ class DotsPage(Page):
 
     def choose(self, way: Callable[..., None], *given: object) -> None:
         """Select dots by a function, and show the selection."""
+        self.editor.refusal = ""
         way(*given)
         self.draw()
 
@@ -298,12 +299,16 @@ class DotsPage(Page):
         if not stood and before is not None and before[0] == seen.frame:
             self._before = before  # edits before the fit is done are compared as one
         done = self.workspace.attempt(
-            lambda session: session.correct({seen.frame: edit()}, f"{label}, frame {seen.frame}")
+            lambda session: session.correct({seen.frame: edit()}, f"{label}, frame {seen.frame}"),
+            beside=self._tell_refusal,
         )
         if not done:
             self._before = before
             self.draw()
         return done
+
+    def _tell_refusal(self, words: str) -> None:
+        self.editor.refusal = words
 
     def _assign(self, what: str, value: float | None) -> None:
         if value is not None:
@@ -347,9 +352,9 @@ class DotsPage(Page):
     def _escape(self) -> None:
         if self.dot_tool.busy:
             self.dot_tool.give_up()
+            self.draw()
         else:
-            self.editor.choose_none()
-        self.draw()
+            self.choose(self.editor.choose_none)
 
     def _type_row(self) -> None:
         self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
