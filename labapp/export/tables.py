@@ -26,6 +26,7 @@ from labapp.export.frame_result import FrameResult
 from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, as_cell, csv_text, unescaped_csv_text
 
 PX_DIGITS, MM_DIGITS = 4, 6
+_NEGATIVE_ZERO = f"{-0.0:.{MM_DIGITS}f}"
 
 UNITS = ("mm", "mm2", "mm3", "px", "deg", "s")
 NO_UNIT = "1"
@@ -328,7 +329,7 @@ def nodes_csv(nodes: FloatArray) -> bytes:
     """Return the nodes of a surface, shape (n, 3), mm, as CSV `x_mm,y_mm,z_mm`."""
     text = io.StringIO()
     np.savetxt(text, nodes, f"%.{MM_DIGITS}f", ",", header="x_mm,y_mm,z_mm", comments="")
-    return text.getvalue().encode()
+    return text.getvalue().replace(_NEGATIVE_ZERO, _NEGATIVE_ZERO[1:]).encode()
 
 
 def number(value: float | None, digits: int = MM_DIGITS) -> str:

@@ -22,6 +22,7 @@ from labapp.export.tables import (
     csv_header,
     csv_rows,
     frame_tables,
+    nodes_csv,
     number,
     table_rows,
 )
@@ -111,3 +112,10 @@ def test_rows_of_a_frame_are_those_of_its_tables(time_s: float | None, parts: bo
         expected = {name: csv_rows(name, table, parts) for name, table in tables.items()}
         assert table_rows(result, calibration, parts) == expected
         assert list(expected) == list(TABLES)
+
+
+def test_nodes_have_no_negative_zero() -> None:
+    text = nodes_csv(np.array([[-1e-9, -0.0, -4e-7], [-10.0, 0.1, -0.000001]])).decode()
+    rows = [[float(cell) for cell in line.split(",")] for line in text.splitlines()[1:]]
+    assert rows == [[0.0, 0.0, 0.0], [-10.0, 0.1, -1e-6]]
+    assert not np.signbit(rows[0]).any()
