@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from labapp.core.surface.measures import NODES_MM
 from labapp.core.surface.mesh import grid_nodes, surface_mesh
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 from labapp.errors import InputError
 
-SPACING_MM = 0.1
+SPACING_MM = NODES_MM
 """Distance between the rings of a mesh, and between the nodes of a surface as CSV, mm."""
 
 SMALLEST_SPACING_MM = 0.05

@@ -176,6 +176,18 @@ def test_mesh_ends_at_the_boundary_and_faces_up():
     assert vertices[:, 2].max() == pytest.approx(0.29, abs=0.01)
 
 
+@pytest.mark.parametrize("algorithm", ["opa", "epa-r", "epa-c", "epa-rc"])
+def test_no_node_is_beyond_height_and_depth(algorithm):
+    # An interpolated surface has creases, also between the samples along the spokes.
+    for pool in (egg(6.6, 3.0, 4.0, 0.3), egg(6.0, 3.0, 4.2, -0.2), spherical_cap(6.0, 0.3)):
+        match = exact_match(trace(pool, RIG), sigma_mm=0.05, rng=np.random.default_rng(3))
+        made = irs.reconstruct(match, RIG, irs.IrsSettings(algorithm=algorithm))
+        measures = measure_surface(made, match, RIG)
+        z = grid_nodes(made, 0.1)[2]
+        assert measures.depth_mm - 1e-9 <= z.min()
+        assert z.max() <= measures.height_mm + 1e-9
+
+
 @pytest.mark.parametrize(
     ("scheme", "settings"), [(irs, irs.IrsSettings()), (ers, ers.ErsSettings())], ids=["irs", "ers"]
 )

@@ -21,6 +21,12 @@ from labapp.core.values import BoolArray, FloatArray, IntArray
 RINGS = 16
 """Samples along each radius; Gauss–Legendre, so that smooth pools are integrated exactly."""
 
+NODES_MM = 0.1
+"""Distance of the grid nodes among which extremes are searched; files have the same nodes."""
+
+MOST_STEPS = 300
+"""Most of these distances along the larger extent of a pool; above it, they are longer."""
+
 STENCIL_MM = 0.1
 """Half the size of the patch on which an extreme is refined."""
 
@@ -251,11 +257,30 @@ def surface_sizes(surface: Surface, boundary: Boundary) -> tuple[FloatArray, Flo
     samples = spoke_points(surface, boundary, fraction)
     # ∫∫ z dA over triangles about the centre: each spoke represents half of the two adjacent ones.
     volume = wedge @ (samples[..., 2] @ (weight * fraction))
-    points = np.vstack([samples.reshape(-1, 3), outline])
+    points = np.vstack([samples.reshape(-1, 3), outline, _nodes(surface, boundary)])
     high = refined(surface.height, boundary, points[np.nanargmax(points[:, 2])], sign=1.0)
     low = refined(surface.height, boundary, points[np.nanargmin(points[:, 2])], sign=-1.0)
     peak = high if abs(high[2]) >= abs(low[2]) else low
     return np.array([width, length, high[2], low[2], wedge.sum(), volume]), peak[:2]
+
+
+def _nodes(surface: Surface, boundary: Boundary) -> FloatArray:
+    """Surface points of the grid that files have, or of a coarser one, shape (n, 3).
+
+    An interpolated surface has creases, so that its extremes can be between the spokes.
+    """
+    spacing = max(NODES_MM, float(np.ptp(boundary.points_mm[:, :2], axis=0).max()) / MOST_STEPS)
+    x, y = grid_within(boundary, spacing)
+    return np.column_stack([x, y, surface.height(x, y)])
+
+
+def grid_within(boundary: Boundary, spacing_mm: float) -> tuple[FloatArray, FloatArray]:
+    """Nodes x, y of a grid through the origin within the boundary, shape (n,) each, mm."""
+    low = np.ceil(boundary.points_mm[:, :2].min(axis=0) / spacing_mm)
+    high = np.floor(boundary.points_mm[:, :2].max(axis=0) / spacing_mm)
+    x, y = np.meshgrid(*(np.arange(a, b + 1) * spacing_mm for a, b in zip(low, high, strict=True)))
+    inside = boundary.contains(x, y)
+    return x[inside], y[inside]
 
 
 def wedges(boundary: Boundary) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from labapp.core.surface.measures import spoke_points
+from labapp.core.surface.measures import grid_within, spoke_points
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray
 
@@ -13,12 +13,7 @@ def grid_nodes(
     reconstruction: Reconstruction, spacing_mm: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Nodes x, y, z of a grid through the origin within the boundary, shape (n,) each, mm."""
-    boundary = reconstruction.boundary
-    low = np.ceil(boundary.points_mm[:, :2].min(axis=0) / spacing_mm)
-    high = np.floor(boundary.points_mm[:, :2].max(axis=0) / spacing_mm)
-    x, y = np.meshgrid(*(np.arange(a, b + 1) * spacing_mm for a, b in zip(low, high, strict=True)))
-    inside = boundary.contains(x, y)
-    x, y = x[inside], y[inside]
+    x, y = grid_within(reconstruction.boundary, spacing_mm)
     return x, y, reconstruction.surface.height(x, y)
 
 
