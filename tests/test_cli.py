@@ -742,6 +742,7 @@ def test_detect_rejects_an_impossible_size(
     code, _, stderr = labapp("detect", two_sizes, "--size", size, "--out", out)
     assert code == 2
     assert "--size" in stderr
+    assert size in stderr
     assert not out.exists()
 
 

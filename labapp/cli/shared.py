@@ -108,13 +108,29 @@ def reject_empty_path(parameter: Any, ctx: Any, value: Any) -> None:
         raise typer.BadParameter("the path is empty; . is the current folder", ctx, parameter)
 
 
+@contextmanager
+def _values_in_errors(value: object) -> Iterator[None]:
+    """Name the value in errors about what it should be, which otherwise have only the latter."""
+    try:
+        yield
+    except typer.BadParameter as error:
+        message = error.message.removeprefix("Value error, ")
+        if message != (expected := message.removeprefix("Input should be ")):
+            given = " ".join(map(str, value)) if isinstance(value, list | tuple) else value
+            number = "a number " if expected.startswith(("greater", "less")) else ""
+            message = f"{given}; expected {number}{expected.partition(', unable')[0]}"
+        error.message = message
+        raise
+
+
 class Argument(typer.core.TyperArgument):
     """Argument that the help names in capitals, without its type."""
 
     def process_value(self, ctx: Any, value: Any) -> Any:
         """Convert the text of the command line."""
         reject_empty_path(self, ctx, value)
-        return super().process_value(ctx, value)
+        with _values_in_errors(value):
+            return super().process_value(ctx, value)
 
     @property
     def display_name_raw(self) -> str:
@@ -138,7 +154,8 @@ class Option(typer.core.TyperOption):
     def process_value(self, ctx: Any, value: Any) -> Any:
         """Convert the text of the command line."""
         reject_empty_path(self, ctx, value)
-        return super().process_value(ctx, value)
+        with _values_in_errors(value):
+            return super().process_value(ctx, value)
 
     def display_type(self, ctx: Any) -> str:
         """Return the kind of value of an option without ``metavar``."""
