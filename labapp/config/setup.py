@@ -22,7 +22,7 @@ from labapp.config.bench_check import (
     unchecked_values,
 )
 from labapp.config.ray_file import text_with_rays
-from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
+from labapp.config.setup_keys import OPTIONAL, SECTIONS, THREE_POINTS, rules_for
 from labapp.config.setup_text import frame_px_of, image_calibration_of, incomplete_lens
 from labapp.config.toml_keys import (
     check_keys,
@@ -162,11 +162,20 @@ def parse_setup(text: str, path: str | os.PathLike[str], lines: bool = False) ->
     # Values are compared with each other only if each is valid.
     problems = problems or [*_contradictions(path, values), *section_contradictions(path, values)]
     if problems:
-        raise InputError.gather(problems)
+        raise InputError.gather([_of_either_form(problem) for problem in problems])
     calibration = _calibration(values)
     rig = _rig(values, calibration)
     checked = rig.uncertainty is not None and rig.uncertainty.checked
     return Setup(rig, calibration, text, values["bench_check"]["date"] if checked else "")
+
+
+def _of_either_form(problem: InputError) -> InputError:
+    """Problem of a key of the three points beside a homography, which replaces them."""
+    section, _, key = problem.field.partition(".")
+    if section != "image_calibration" or key not in THREE_POINTS or problem.value != "unknown key":
+        return problem
+    expected = "homography or the keys of the three points, not both"
+    return InputError(problem.source, problem.field, problem.value, expected)
 
 
 def update_setup(

@@ -249,8 +249,9 @@ def test_pattern_without_rays_is_rejected(path: Path) -> None:
 
 def test_two_forms_of_calibration_are_rejected(path: Path) -> None:
     path.write_text(HOMOGRAPHY + "z_axis_mm = 31.75\n")
-    with pytest.raises(InputError, match=r"image_calibration\.z_axis_mm: unknown key"):
+    with pytest.raises(InputError, match=r"image_calibration\.z_axis_mm: unknown key") as caught:
         read_setup(path)
+    assert "homography" in caught.value.expected  # not a key that is merely spelt alike
 
 
 def test_all_problems_are_reported_together(path: Path) -> None:
