@@ -108,6 +108,18 @@ def test_base_height_has_least_are_or_is_zero_within_the_margin():
     assert are(*heights, margin=10.0) == each[0.0]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("pool", [*off_centre(caps_8_3_1(), 1), egg(6.6, 3.0, 4.0, 0.35)])
+def test_the_boundary_determines_the_base_height(pool):
+    # The ARE of the points hardly depends on the base height: by it alone heights were up to 230 %
+    # off, and convex pools came out as concave ones.
+    match = match_of(pool)
+    settings = irs.IrsSettings(boundary="circle")
+    measures = measure_surface(irs.reconstruct(match, RIG, settings), match, RIG)
+    depth = measures.height_mm if pool.peak_mm > 0 else -measures.depth_mm
+    assert depth == pytest.approx(abs(pool.peak_mm), rel=0.3)
+
+
 def test_base_point_is_the_lower_left_dot():
     match = match_of(spherical_cap(6.0, 0.3))
     lowest = match.reflected[:, 0] == 1

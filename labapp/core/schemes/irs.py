@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,8 +22,9 @@ from labapp.core.schemes.slopes import (
     reflected_rays,
     rows_or_columns,
 )
-from labapp.core.surface.boundary import BoundaryModel, boundary_on_work_piece
+from labapp.core.surface.boundary import Boundary, BoundaryModel, boundary_on_work_piece
 from labapp.core.surface.interpolation import CloughTocherSurface
+from labapp.core.surface.measures import reflection_errors
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
@@ -43,8 +45,10 @@ class IrsSettings:
     base_heights_mm
         Heights of the base point that the one-point algorithm tries, mm.
     are_margin
-        Heights whose ARE exceeds the smallest by no more than this share explain the dots equally
-        well, and the one nearest z = 0 is chosen; with 0 the smallest ARE is chosen.
+        With 0 the height of the smallest ARE of the points is chosen, as in the text. Otherwise
+        the whole surfaces, which end at the boundary, are compared: heights whose ARE exceeds the
+        smallest by no more than this share explain the dots equally well, and the one nearest
+        z = 0 is chosen.
     boundary
         Boundary model: ``piecewise`` (§6.3.2) or ``circle`` (§8.2.1).
     """
@@ -68,9 +72,16 @@ def reconstruct(match: Match, rig: Rig, settings: IrsSettings) -> Reconstruction
         ``too-few-dots``, ``no-surface`` or ``no-boundary``.
     """
     rays = reflected_rays(match, rig)
-    best = _best(estimates(match, rays, settings), settings.are_margin)
+    found = estimates(match, rays, settings)
+    if not found:
+        raise CannotMeasure("no-surface", "the reflection points diverge from the first loop on")
+    if not settings.are_margin:
+        found = [min(found, key=lambda pair: pair[1].are_mm)]
     boundary = boundary_on_work_piece(match, rig, settings.boundary)
-    return reconstruction_within("irs", match, rays, best, boundary)
+    wholes = _whole_surfaces(match, rig, rays, found, boundary)
+    least = min(are_mm for _, are_mm, _ in wholes)
+    equals = [each for each in wholes if each[1] <= least * (1 + settings.are_margin)]
+    return min(equals, key=lambda each: (abs(each[0]), each[1]))[2]
 
 
 def estimates(
@@ -106,13 +117,37 @@ def lower_left(match: Match) -> int:
     return int(np.argmin(np.where(lowest, match.plane_mm[:, 0], np.inf)))
 
 
-def _best(found: list[tuple[float, Estimate]], are_margin: float) -> Estimate:
-    """Select the estimate of least ARE; among equivalent ones that with a base nearest z = 0."""
-    if not found:
-        raise CannotMeasure("no-surface", "the reflection points diverge from the first loop on")
-    least = min(estimate.are_mm for _, estimate in found)
-    equals = [pair for pair in found if pair[1].are_mm <= least * (1 + are_margin)]
-    return min(equals, key=lambda pair: (abs(pair[0]), pair[1].are_mm))[1]
+def _whole_surfaces(
+    match: Match,
+    rig: Rig,
+    rays: ReflectedRays,
+    found: list[tuple[float, Estimate]],
+    boundary: Boundary,
+) -> list[tuple[float, float, Reconstruction]]:
+    """Height of the base point, ARE and whole surface of each estimate, at least one; mm.
+
+    The ARE of the points hardly depends on the height. That of the surface through points and
+    boundary does.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-surface`` if no estimate has a whole surface.
+    """
+    wholes: list[tuple[float, float, Reconstruction]] = []
+    refused = CannotMeasure("no-surface", "no ray meets the surface within the boundary")
+    for height_mm, estimate in found:
+        try:
+            whole = reconstruction_within("irs", match, rays, estimate, boundary)
+        except CannotMeasure as error:
+            refused = error
+            continue
+        are_mm = reflection_errors(whole, match, rig)["are_mm"]
+        if math.isfinite(are_mm):
+            wholes.append((height_mm, are_mm, whole))
+    if not wholes:
+        raise refused
+    return wholes
 
 
 def _one_point(
