@@ -249,6 +249,20 @@ def test_numbers_of_a_short_axis_do_not_overlap(
     assert spacing <= high - low
 
 
+@pytest.mark.parametrize("low_high", [(70.9, 79.4), (70.0, 79.0), (6.1, 6.7), (-0.04, 0.21)])
+def test_short_axis_has_two_numbers_that_are_not_rounded(
+    qapp: object, low_high: tuple[float, float]
+) -> None:
+    low, high = low_high
+    axis, line_px = PlainAxis("left"), QFontMetricsF(QGuiApplication.font()).height()
+    length_px = 3.6 * line_px
+    spacing, _ = axis.tickSpacing(low, high, length_px)[0]
+    ticks = spacing * np.arange(np.ceil(low / spacing), np.floor(high / spacing) + 1)
+    room = line_px / 2 / length_px * (high - low)
+    assert ((ticks > low + room) & (ticks < high - room)).sum() > 1
+    assert [float(text) for text in axis.tickStrings(ticks, 1.0, spacing)] == pytest.approx(ticks)
+
+
 def test_numbers_of_an_axis_are_not_cut_off_at_its_ends(qtbot: QtBot):
     plot = make_plot("along (mm)", "height (mm)", equal=False)
     qtbot.addWidget(plot)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor, QFontMetricsF, QGuiApplication
@@ -29,14 +30,29 @@ class PlainAxis(pg.AxisItem):  # type: ignore[misc]
         self.setStyle(hideOverlappingLabels=True)
 
     def tickSpacing(self, low: float, high: float, length_px: float) -> list[tuple[float, float]]:
-        """Spacings of ticks, widest first, and their offsets: as wide as a line of text."""
+        """Spacings of ticks, widest first, and their offsets.
+
+        Numbers of an upright axis are as far apart as a line of text, and two or more if possible.
+        """
         levels: list[tuple[float, float]] = super().tickSpacing(low, high, length_px)
-        line_px = QFontMetricsF(QGuiApplication.font()).height()
-        spacing, least = levels[0][0], line_px * (high - low) / length_px
-        if self.orientation not in {"left", "right"} or spacing >= least:
+        if self.orientation not in {"left", "right"}:
             return levels
-        wider = [spacing * times for times in (2, 5, 10) if spacing * times >= least]
-        return [(wider[0], 0.0), *levels] if wider else levels
+        spacing = levels[0][0]
+        line = QFontMetricsF(QGuiApplication.font()).height() * (high - low) / length_px
+        first, last = low + line / 2, high - line / 2  # others are cut off at the ends
+        ten = 10 ** np.floor(np.log10(spacing))
+        steps = [spacing, *(ten * np.array([0.1, 0.2, 0.25, 0.5, 1, 2, 2.5, 5, 10, 20, 50]))]
+        readable = [step for step in steps if step >= line]
+        several = [step for step in readable if last // step - -(-first // step) >= 1]
+        step = next(iter(several or readable), spacing)
+        return [(step, 0.0), *(level for level in levels if level[0] < step)]
+
+    def tickStrings(self, values: Sequence[float], scale: float, spacing: float) -> list[str]:
+        """Numbers at ticks, with the decimals of a spacing such as 2.5, which pyqtgraph rounds."""
+        is_whole = np.isclose(spacing * 10 ** np.ceil(-np.log10(spacing)) % 1, [0, 1]).any()
+        finer = spacing if is_whole else spacing / 10
+        numbers: list[str] = super().tickStrings(values, scale, finer)
+        return numbers
 
     def updateAutoSIPrefix(self) -> None:
         """Keep the numbers unscaled."""
