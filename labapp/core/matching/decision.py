@@ -104,9 +104,8 @@ def decide(
     cheapest = best  # rivals keep their doubtful labels: they are compared with this one
     if fit_settings == FINE_FIT:
         cheapest = evaluate_averaged(observed, best.labels, fit_settings, best.pool) or best
-    best = without_doubtful_outermost(
-        observed, without_false_ends(observed, best, fit_settings), fit_settings
-    )
+    ended = without_false_ends(observed, best, fit_settings)
+    best = without_doubtful_outermost(observed, ended, fit_settings)
     if fit_settings == FINE_FIT:
         best = evaluate_averaged(observed, best.labels, fit_settings, best.pool) or best
     refuse_unexplained(observed, best, settings, most_scattered)
@@ -127,8 +126,8 @@ def decide(
             doubtful += differing
         else:
             rivals.append((other.labels, _excess(other, cheapest)))
-    best = _without(observed, best, doubtful, fit_settings)
-    best = supported(observed, best, fit_settings)
+    best = supported(observed, _without(observed, best, doubtful, fit_settings), fit_settings)
+    best = _with_unknown(observed, best, ended.labels, fit_settings)
     _refuse_hidden_marker(observed, best)
     refuse_hidden_rows(observed, best, fit_settings)
     known = KnownRays.of(observed.rig, best.ray_states, best.pool.surface.basis, 0.0)
@@ -229,18 +228,14 @@ def _step(one: IntArray, other: IntArray) -> tuple[int, int]:
 
 
 def supported(observed: Observation, best: Hypothesis, fit_settings: FitSettings) -> Hypothesis:
-    """Remove the labels that the surface through the other dots does not support.
-
-    Their rays, which count as dark while the remaining labels are evaluated, do not affect the
-    level of the result.
-    """
+    """Remove the labels that the surface through the other dots does not support."""
     for _ in range(MOST_LEFT_OUT):
         converged = _converged(observed, best, fit_settings)
         wrong = unsupported(observed, fitted_labels(observed, converged, fit_settings))
         if len(wrong) == 0:
             break
         best = _without(observed, best, wrong, fit_settings)
-    return _refitted(observed, best, fit_settings)
+    return best
 
 
 def _without(
@@ -254,6 +249,17 @@ def _without(
     return replace(
         evaluate(observed, certain, fit_settings, initial=best.pool) or best, ray_states=ray_states
     )
+
+
+def _with_unknown(
+    observed: Observation, best: Hypothesis, before: IntArray, fit_settings: FitSettings
+) -> Hypothesis:
+    """Set the rays that lost their label to unknown, and refit: they were fitted as dark."""
+    lost = (before != UNLABELLED) & (best.labels == UNLABELLED)
+    if not lost.any():
+        return best
+    ray_states = np.where(lost, 0, best.ray_states)
+    return _refitted(observed, replace(best, ray_states=ray_states), fit_settings)
 
 
 def _converged(observed: Observation, best: Hypothesis, fit_settings: FitSettings) -> Hypothesis:
