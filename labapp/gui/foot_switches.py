@@ -18,6 +18,7 @@ from labapp.media.devices import hid
 from labapp.media.devices.foot_switch import FootSwitch, Learned, PedalAction, PedalMap, learn
 from labapp.media.devices.hid import AWAY, LONGEST, UNPLUGGED, HidError, HidInfo
 from labapp.media.events import Event
+from labapp.text import capitalized
 
 POLL_MS = 20
 """Interval, ms, at which presses are handled."""
@@ -222,7 +223,7 @@ class FootSwitches(QObject):
             self._learning, self.unavailable = None, ()
             self._deaf_until_s = time.monotonic() + DEAF_S
             if isinstance(answer, str):
-                self.notified.emit(answer, True)
+                self.notified.emit(capitalized(answer), True)
                 self.look()
             else:
                 self.learned = answer

@@ -27,6 +27,7 @@ from labapp.media.devices import foot_switch, hid
 from labapp.media.devices.foot_switch import PedalMap
 from labapp.media.devices.hid import HidInfo
 from labapp.session.session import Session
+from labapp.text import capitalized
 from tests.gui.conftest import KEPT, CopySample, let_draw
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
@@ -321,8 +322,10 @@ def test_missing_foot_switch_is_reported(start, bench: Bench, copy_sample, qtbot
     hand.button("Find devices")
     qtbot.waitUntil(lambda: "No known foot switch" in panel.words.text())
     hand.button("Learn a pedal")
-    message = "no foot switch is connected: plug it in"
-    qtbot.waitUntil(lambda: window.status_line.unread == [message])
+    with pytest.raises(hid.HidError) as why:
+        foot_switch.learn(threading.Event(), list)
+    qtbot.waitUntil(lambda: window.status_line.unread == [capitalized(str(why.value))])
+    assert window.status_line.unread[0][0].isupper()
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     assert panel.learn_button.text() == "Learn a pedal"
 
