@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from labapp.session.frames import Progress
     from labapp.session.record import (
         BenchCheckRecord,
+        LaserEntries,
         LaserReadings,
         PlanePicture,
         Record,
@@ -117,6 +118,12 @@ class SessionContents:
         from labapp.config.setup_text import pattern_kind
 
         return pattern_kind(self.setup_text) == "lines"
+
+    @property
+    def laser_entries(self) -> LaserEntries | None:
+        """Readings of the laser's cross that are not applied yet; None if there are none."""
+        found: LaserEntries | None = self._documents.get("laser-entries")
+        return found
 
     @property
     def laser_calibration(self) -> LaserReadings | None:

@@ -26,7 +26,9 @@ BUSY_S = 30.0
 OF_A_RECORDING = ("correction", "signals")
 """Kinds of documents that belong to the recording."""
 
-OF_A_BENCH: tuple[Kind, ...] = ("setup", "laser-calibration", "plane-calibration", "bench-check")
+OF_A_BENCH: tuple[Kind, ...] = (
+    *("setup", "laser-entries", "laser-calibration", "plane-calibration", "bench-check"),
+)
 """Kinds of documents that belong to the bench."""
 
 

@@ -1,8 +1,8 @@
 """Documents of a session, with persistent undo and redo.
 
 A document is a unit of the operator's input: the record, the set-up, the settings, a calibration,
-the correction of one frame, the weld's signals, the limits of the sizes. A change sets some of
-them, and stores their former values, in one transaction.
+readings for one, the correction of one frame, the weld's signals, the limits of the sizes. A change
+sets some of them, and stores their former values, in one transaction.
 """
 
 from __future__ import annotations
@@ -20,7 +20,13 @@ from labapp.session.file.blobs import Damaged, fingerprint_of, pack, unpack, unp
 from labapp.session.file.database import Database
 from labapp.session.file.read_cache import ReadCache
 from labapp.session.file.schema import NO_FRAME
-from labapp.session.record import BenchCheckRecord, LaserReadings, PlanePicture, Record
+from labapp.session.record import (
+    BenchCheckRecord,
+    LaserEntries,
+    LaserReadings,
+    PlanePicture,
+    Record,
+)
 from labapp.session.signals import Signals
 from labapp.text import now
 
@@ -28,6 +34,7 @@ Kind = Literal[
     "record",
     "setup",
     "settings",
+    "laser-entries",
     "laser-calibration",
     "plane-calibration",
     "bench-check",
@@ -42,6 +49,7 @@ CLASSES: dict[str, Any] = {
     "record": Record,
     "setup": str,
     "settings": Settings,
+    "laser-entries": LaserEntries,
     "laser-calibration": LaserReadings,
     "plane-calibration": PlanePicture,
     "bench-check": BenchCheckRecord,

@@ -69,6 +69,18 @@ class LaserReadings:
 
 
 @dataclass(frozen=True)
+class LaserEntries:
+    """Readings of the laser's cross as the operator entered them, not applied yet."""
+
+    cells: tuple[tuple[str, str, str], ...]
+    """Texts of l1, l2 and l3, mm, a line for each time; a text may be empty, or no length."""
+    fan_angle_deg: float
+    fan_angle_sigma_deg: float
+    resolution_mm: float
+    """Fan angle, its standard uncertainty and step of the callipers, as in `LaserReadings`."""
+
+
+@dataclass(frozen=True)
 class PlanePicture:
     """An imaging-plane calibration (§5.1) and its picture."""
 

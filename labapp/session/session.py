@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from labapp.run.runner import Measurer, Sink
     from labapp.session.documents import Change, Key
     from labapp.session.frames import Progress
-    from labapp.session.record import BenchCheckRecord, Record, Recording
+    from labapp.session.record import BenchCheckRecord, LaserEntries, Record, Recording
     from labapp.session.signals import Signals
 
 
@@ -170,6 +170,16 @@ class Session(SessionContents):
             require(keys, Mapping, "update_setup", section, right)
         self._documents.change(label, {("setup", NO_FRAME): self._updated_setup(values)})
 
+    def set_laser_entries(self, entries: LaserEntries) -> None:
+        """Store readings of the laser's cross until `calibrate_laser` applies some.
+
+        Parameters
+        ----------
+        entries
+            The readings as they were entered.
+        """
+        self._documents.change("laser readings", {("laser-entries", NO_FRAME): entries})
+
     def calibrate_laser(
         self,
         l1_mm: Sequence[float],
@@ -216,6 +226,7 @@ class Session(SessionContents):
         known = settings.fan_angle_sigma_deg, settings.resolution_mm
         readings = LaserReadings(*lengths, fan_angle_deg, found, sha256, *known)
         values: dict[Key, Any] = {
+            ("laser-entries", NO_FRAME): None,
             ("laser-calibration", NO_FRAME): readings,
             ("setup", NO_FRAME): self._updated_setup({"laser": found.setup_keys}),
         }

@@ -21,7 +21,7 @@ from labapp.gui.pages.laser.page import LaserPage
 from labapp.gui.shell.window import MainWindow
 from labapp.media import open_source
 from labapp.session.copies import move_session, use_setup_of
-from labapp.session.record import Record
+from labapp.session.record import LaserEntries, Record
 from labapp.session.session import Session
 from tests.gui.conftest import SAMPLES, CopySample, let_draw
 from tests.gui.hand import CONTROL, Hand
@@ -288,11 +288,15 @@ def test_setup_of_another_session_includes_its_calibrations(
         text, calibration = session.setup_text, session.plane_calibration
     assert calibration is not None
     with Session.create(tmp_path / "new.labsession") as session:
+        entries = LaserEntries((("4.6", "", ""),), 10.0, 0.1, 0.05)
+        session.set_laser_entries(entries)
         use_setup_of(session, other)
         assert (session.setup_text, session.plane_calibration) == (text, calibration)
         assert session.picture(calibration.picture_sha256).ndim == 2
+        assert session.laser_entries is None  # they are of another bench
         session.undo()
         assert (session.setup_text, session.plane_calibration) == ("", None)
+        assert session.laser_entries == entries
     with Session.create(tmp_path / "bare.labsession") as bare, pytest.raises(InputError):
         use_setup_of(bare, tmp_path / "new.labsession")
 

@@ -13,6 +13,7 @@ import pytest
 from labapp.core.pipeline import Settings
 from labapp.errors import InputError
 from labapp.session.copies import next_session
+from labapp.session.record import LaserEntries
 from labapp.session.session import Session
 
 SAMPLES = Path(__file__).parents[2] / "sample_sessions"
@@ -28,6 +29,7 @@ def first(tmp_path: Path) -> Path:
         session.set_record(replace(session.record, operator="A. Welder", safety=ticked))
         setup = session.setup_text
         session.calibrate_laser([4.65], [6.23], [2.75], picture=np.eye(30, dtype=np.uint8))
+        session.set_laser_entries(LaserEntries((("4.6", "", ""),), 10.0, 0.1, 0.05))
         session.set_setup(setup)  # the set-up of the sample, with which the recording was made
         session.set_settings(replace(session.settings, scheme="ers"))
     return path
@@ -52,6 +54,7 @@ def test_next_session_has_the_bench_without_the_recording(first: Path, tmp_path:
             assert laser.picture_sha256 is not None
             picture = second.picture(laser.picture_sha256)
             assert np.array_equal(picture, np.eye(30, dtype=np.uint8))
+            assert second.laser_entries == session.laser_entries is not None
             assert second.plane_calibration == session.plane_calibration
             assert second.recording is None
             assert len(second.frames) == 0

@@ -23,7 +23,7 @@ from labapp.export.results import ResultsWriter
 from labapp.media import open_source
 from labapp.run.measurers import measuring_pool
 from labapp.session.file.blobs import pack
-from labapp.session.record import Record
+from labapp.session.record import LaserEntries, Record
 from labapp.session.results.measured import CORRECTION_CHANGED, SETTINGS_CHANGED, SETUP_CHANGED
 from labapp.session.session import Session
 from tests.scripts import run_python
@@ -451,6 +451,22 @@ def test_laser_calibration_changes_the_rig_until_undo(session: Session):
     session.undo()
     assert session.laser_calibration is None
     assert session.setup.rig.laser.distance_mm == pytest.approx(31.48)
+
+
+def test_laser_entries_are_kept_until_some_are_applied(session: Session):
+    entries = LaserEntries((("13,7", "", "7.9"), ("x", "18.5", "")), 10.0, 0.1, 0.02)
+    assert session.laser_entries is None
+    session.set_laser_entries(entries)
+    session.close()
+    with Session.open(session.path) as reopened:
+        assert reopened.laser_entries == entries
+        assert reopened.laser_calibration is None
+        reopened.calibrate_laser([13.676], [18.561], [7.874])
+        assert reopened.laser_entries is None
+        assert reopened.problems() == []
+        reopened.undo()
+        assert reopened.laser_entries == entries
+        assert reopened.problems() == []
 
 
 def test_plane_calibration_stores_its_picture(session: Session):

@@ -43,6 +43,7 @@ from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.run.limits import Limits
 from labapp.session.record import (
     BenchCheckRecord,
+    LaserEntries,
     LaserReadings,
     MirrorPicture,
     PlanePicture,
@@ -177,6 +178,7 @@ STORED = {
     "ImageCalibration": Stored(ImageCalibration, shapes={"matrix": "3 3"}),
     "Lens": Stored(Lens),
     "RadialDistortion": Stored(RadialDistortion, shapes={"matrix": "3 3", "half_mm": "2"}),
+    "LaserEntries": Stored(LaserEntries),
     "LaserReadings": Stored(LaserReadings),
     "LaserCalibration": Stored(LaserCalibration),
     "PlanePicture": Stored(PlanePicture),

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from PySide6.QtCore import QItemSelectionModel, Qt
+from PySide6.QtWidgets import QLineEdit
 from pytestqt.qtbot import QtBot
 
 from labapp.core.calibration.laser_calibration import calibrate_laser
+from labapp.errors import InputError
 from labapp.gui.pages.laser import presenter
 from labapp.gui.pages.laser.page import LaserPage
 from labapp.gui.pages.laser.presenter import ENDS, SCALE, Readings
 from labapp.gui.shell.steps import states
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.tasks import DONE
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT
+from tests.gui.hand import Hand
 
 CROSS = ((13.676,), (18.561,), (7.874,))
 
@@ -117,10 +122,11 @@ def test_applied_calibration_is_stored_with_its_readings(tmp_path: Path) -> None
 # --- the page ---------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[LaserPage]:
+@contextmanager
+def page_of(path: Path) -> Iterator[LaserPage]:
+    """The page alone, of a session that is open nowhere else."""
     workspace = Workspace()
-    workspace.show(Session.open(copy_sample("gtaw")))
+    workspace.show(Session.open(path))
     laser_page = LaserPage(workspace)
     KEPT.extend([workspace, laser_page, laser_page.panel])
     workspace.changed.connect(lambda: laser_page.refresh() if workspace.session else None)
@@ -129,6 +135,12 @@ def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[LaserPage
     laser_page.panel.show()
     yield laser_page
     workspace.close()
+
+
+@pytest.fixture
+def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[LaserPage]:
+    with page_of(copy_sample("gtaw")) as laser_page:
+        yield laser_page
 
 
 def fill(page: LaserPage, row: int, texts: tuple[str, ...]) -> None:
@@ -146,6 +158,10 @@ def presenter_cell(text: str):
     return _cell(text)
 
 
+def done_steps(session: Session) -> int:
+    return sum(not change.undone for change in session.history)
+
+
 def clear(page: LaserPage) -> None:
     page.table.selectAll()
     page.table.setFocus()
@@ -156,7 +172,7 @@ def clear(page: LaserPage) -> None:
 def test_typed_readings_are_applied_and_undone(qtbot: QtBot, page: LaserPage) -> None:
     session = page.workspace.session
     assert session is not None
-    before = session.setup.rig.laser, page.readings()
+    before, steps = (session.setup.rig.laser, page.readings()), done_steps(session)
     clear(page)
     assert not page.use_button.isEnabled()
     assert "Enter at least one reading" in page.words.text()
@@ -172,8 +188,111 @@ def test_typed_readings_are_applied_and_undone(qtbot: QtBot, page: LaserPage) ->
     fill(page, 0, ("13,676",))
     assert page.applied.text().startswith(DONE)
     page.workspace.undo()
+    assert page.readings().lengths_mm[0] == (13.5,)
+    page.workspace.undo()
+    assert page.applied.text().startswith(DONE)
+    page.workspace.undo()  # of Apply: what was typed stays, so that it can be corrected
     assert page.applied.text() == ""
+    assert page.readings().lengths_mm == CROSS
+    assert session.setup.rig.laser == before[0]
+    while done_steps(session) > steps:
+        page.workspace.undo()
     assert (session.setup.rig.laser, page.readings()) == before
+
+
+TYPED = (("13,7", "18.5", "7.9"), ("13.6", "", "7.8"), ("a", "18.6", ""))
+"""Not yet complete: empty cells, and one that is no length."""
+
+
+@pytest.mark.parametrize("way", ["close", "another session", "quit"])
+def test_typed_readings_are_stored_with_the_session_until_applied(
+    window: MainWindow, copy_sample: Callable[[str], Path], qtbot: QtBot, way: str
+) -> None:
+    path, other, hand = copy_sample("thumb_tack"), copy_sample("gtaw"), Hand(window)
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow)
+    assert window.files.open(path)
+    window.show_step("laser")
+    typed_in = window.page
+    assert isinstance(typed_in, LaserPage)
+    clear(typed_in)
+    for row, texts in enumerate(TYPED):
+        for column, text in enumerate(texts):
+            hand.cell(typed_in.table, row, column, text)
+    hand.enter(typed_in.resolution, "0.2")
+    setup = typed_in.session.setup_text
+    place = typed_in.table.visualRect(typed_in.table.model().index(2, 2)).center()
+    hand.click(typed_in.table.viewport(), place)
+    hand.type("7.7")  # the cell is still being edited
+    if way == "close":
+        window.do("close")
+    elif way == "another session":
+        assert window.files.open(other)
+        window.show_step("laser")
+        assert typed_in.readings() == Readings()
+    else:
+        window.close()
+    with page_of(path) as again:
+        shown = [tuple(again.table.item(row, k).text() for k in range(3)) for row in range(3)]
+        assert shown == [*TYPED[:2], ("a", "18.6", "7.7")]
+        assert again.resolution.value() == 0.2
+        assert again.session.setup_text == setup  # nothing is applied
+        assert not again.applied.text().startswith(DONE)
+        assert not again.use_button.isEnabled()
+        fill(again, 2, ("13.65",))
+        again.use_button.click()
+        assert again.applied.text().startswith(DONE)
+        applied = again.readings()
+    with page_of(path) as again:
+        assert again.readings() == applied
+        assert again.applied.text().startswith(DONE)
+
+
+def enter_in_first_cell(qtbot: QtBot, page: LaserPage, text: str) -> None:
+    page.table.setCurrentCell(0, 0)
+    page.table.edit(page.table.currentIndex())
+    (editor,) = page.table.viewport().findChildren(QLineEdit)
+    qtbot.keyClicks(editor, text)
+    qtbot.keyClick(editor, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: not page.table.viewport().findChildren(QLineEdit))
+
+
+def test_each_entry_is_one_step_of_undo(qtbot: QtBot, page: LaserPage) -> None:
+    session, steps = page.session, done_steps(page.session)
+    enter_in_first_cell(qtbot, page, "")
+    assert done_steps(session) == steps
+    enter_in_first_cell(qtbot, page, "13.676")
+    assert done_steps(session) == steps + 1
+    enter_in_first_cell(qtbot, page, "")  # which leaves the cell as it is
+    assert done_steps(session) == steps + 1
+    fill(page, 1, ("1", "2", "3"))
+    assert done_steps(session) == steps + 4
+    page.table.selectAll()
+    qtbot.keyClick(page.table, Qt.Key.Key_Delete)
+    assert page.readings().lengths_mm == ((), (), ())
+    assert done_steps(session) == steps + 5
+    page.workspace.undo()
+    assert page.readings().lengths_mm == ((13.676, 1.0), (2.0,), (3.0,))
+    while done_steps(session) > steps:
+        page.workspace.undo()
+    assert page.readings().lengths_mm == ((), (), ())
+
+
+def test_readings_that_cannot_be_stored_stay(
+    page: LaserPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise InputError(page.session.path, "disk", "no space left", "room on the disk")
+
+    clear(page)
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, "set_laser_entries", fail)
+        fill(page, 0, ("1", "2", ""))
+        assert page.readings().lengths_mm == ((1.0,), (2.0,), ())
+    fill(page, 0, ("1", "2", "3"))
+    stored = page.session.laser_entries
+    assert stored is not None
+    assert stored.cells == (("1", "2", "3"),)
 
 
 def test_table_grows_and_delete_clears_cells(qtbot: QtBot, page: LaserPage) -> None:

@@ -25,6 +25,7 @@ from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import RIGHT
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage, read_picture
+from labapp.session.record import LaserEntries
 
 WAYS = (("callipers", "by callipers"), ("picture", "from a picture"))
 
@@ -58,18 +59,19 @@ class LaserPage(Page):
         self.canvas_layout.addWidget(self.canvas)
         self._points: dict[str, DragPoint] = {}
         self._from_picture: GreyImage | None = None
-        self._loaded: object = None
+        self._stored: tuple[Path, LaserEntries] | None = None
         self._make_panel()
         self._show_way("callipers")
 
     def refresh(self) -> None:
-        """Show changed readings in use, and the values in use."""
-        kept = presenter.kept(self.session)
-        loaded = (self.session.path, kept)
-        if loaded != self._loaded:
-            self._loaded = loaded
+        """Show readings that did not change on this page, and the values in use."""
+        former, entries = self._stored, presenter.entries(self.session)
+        self._stored = self.session.path, entries
+        is_same_session = former is not None and former[0] == self.session.path
+        # What could not be stored stays.
+        if self._stored != former and not (is_same_session and entries == self.entries()):
             self._from_picture = None
-            self._fill(kept or Readings())
+            self._fill(entries)
         self.in_use.set_rows(presenter.in_use(self.session))
         self._follow()
 
@@ -80,17 +82,23 @@ class LaserPage(Page):
 
     def readings(self) -> Readings:
         """Readings in the table."""
+        entries = self.entries()
         cells = {
-            (row, column): item.text()
-            for row in range(self.table.rowCount())
-            for column in range(3)
-            if (item := self.table.item(row, column)) is not None
+            (row, k): text for row, line in enumerate(entries.cells) for k, text in enumerate(line)
         }
         settings = LaserCalibrationSettings(
-            resolution_mm=self.resolution.value() or 0.0,
-            fan_angle_sigma_deg=self.fan_sigma.value() or 0.0,
+            resolution_mm=entries.resolution_mm, fan_angle_sigma_deg=entries.fan_angle_sigma_deg
         )
-        return presenter.typed(cells, self.fan.value() or presenter.FAN_ANGLE_DEG, settings)
+        return presenter.typed(cells, entries.fan_angle_deg, settings)
+
+    def entries(self) -> LaserEntries:
+        """All that is entered: the cells of the table without empty rows at the end, the fields."""
+        cells = [self._line(row) for row in range(self.table.rowCount())]
+        while cells and not any(cells[-1]):
+            cells.pop()
+        fan_angle_deg = self.fan.value() or presenter.FAN_ANGLE_DEG
+        known = self.fan_sigma.value() or 0.0, self.resolution.value() or 0.0
+        return LaserEntries(tuple(cells), fan_angle_deg, *known)
 
     def load_picture(self, path: Path) -> None:
         """Show a picture of the cross with points to drag."""
@@ -104,10 +112,10 @@ class LaserPage(Page):
         if lengths is None:
             return
         rows = range(self.table.rowCount())
-        row = next(r for r in rows if all(not self._text(r, c) for c in range(3)))
+        row = next(r for r in rows if not any(self._line(r)))
         self._put(row, [f"{length:.2f}" for length in lengths])
         self._from_picture = self.picture_view.picture
-        self._follow()
+        self._store()
 
     def use(self) -> None:
         """Use the resulting laser in the rig."""
@@ -154,7 +162,7 @@ class LaserPage(Page):
             tooltip="Smallest step of the callipers or ruler: no length is known better than that",
         )
         for each in (self.fan, self.fan_sigma, self.resolution):
-            each.edited.connect(lambda _: self._follow())
+            each.edited.connect(lambda _: self._store())
         form = FieldForm(self.way, self.fan, self.fan_sigma, self.resolution)
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
@@ -199,18 +207,23 @@ class LaserPage(Page):
 
     # --- the readings -----------------------------------------------------------------------
 
-    def _fill(self, readings: Readings) -> None:
-        count = max(map(len, readings.lengths_mm))
+    def _fill(self, entries: LaserEntries) -> None:
         with QSignalBlocker(self.table):
             self.table.setRowCount(0)
-            self.table.setRowCount(max(LEAST_ROWS, count + 1))
-            for column, lengths in enumerate(readings.lengths_mm):
-                for row, length in enumerate(lengths):
-                    self.table.setItem(row, column, _cell(_length(length)))
+            self.table.setRowCount(max(LEAST_ROWS, len(entries.cells) + 1))
+            for row, texts in enumerate(entries.cells):
+                for column, text in enumerate(texts):
+                    self.table.setItem(row, column, _cell(text))
         self.table.fit()
-        self.fan.set_value(readings.fan_angle_deg)
-        self.fan_sigma.set_value(readings.settings.fan_angle_sigma_deg)
-        self.resolution.set_value(readings.settings.resolution_mm)
+        self.fan.set_value(entries.fan_angle_deg)
+        self.fan_sigma.set_value(entries.fan_angle_sigma_deg)
+        self.resolution.set_value(entries.resolution_mm)
+
+    def _store(self) -> None:
+        """Show the result of changed entries, and store them until they are applied."""
+        self._follow()
+        entries = self.entries()
+        self.workspace.attempt(lambda session: presenter.enter(session, entries))
 
     def _put(self, row: int, texts: list[str]) -> None:
         with QSignalBlocker(self.table):
@@ -223,14 +236,17 @@ class LaserPage(Page):
             item.setTextAlignment(RIGHT)
         self._from_picture = None
         self._grow()
-        self._follow()
+        self._store()
 
     def _grow(self) -> None:
         """Keep an empty row at the end."""
         last = self.table.rowCount() - 1
-        if any(self._text(last, column) for column in range(3)):
+        if any(self._line(last)):
             self.table.setRowCount(last + 2)
             self.table.fit()
+
+    def _line(self, row: int) -> tuple[str, str, str]:
+        return self._text(row, 0), self._text(row, 1), self._text(row, 2)
 
     def _text(self, row: int, column: int) -> str:
         item = self.table.item(row, column)
@@ -262,7 +278,7 @@ class LaserPage(Page):
         """Write a length entered in the drawing to the row of the reading that it replaces."""
         rows = range(self.table.rowCount())
         known = (row for row in rows if presenter.length_mm(self._text(row, column)) is not None)
-        text = "" if value is None else _length(value)
+        text = "" if value is None else presenter.length_text(value)
         self.table.setItem(next(known, 0), column, _cell(text))
 
     # --- the picture ------------------------------------------------------------------------
@@ -358,8 +374,12 @@ class _ReadingsTable(QTableWidget):
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Clear the selected cells with Delete."""
         if event.key() in (Qt.Key.Key_Delete, Qt.Key.Key_Backspace):
-            for item in self.selectedItems():
-                item.setText("")
+            items = self.selectedItems()
+            with QSignalBlocker(self):
+                for item in items:
+                    item.setText("")
+            if items:
+                self.itemChanged.emit(items[-1])  # one change, which undo reverts as a whole
         else:
             super().keyPressEvent(event)
 
@@ -368,8 +388,3 @@ def _cell(text: str) -> QTableWidgetItem:
     item = QTableWidgetItem(text)
     item.setTextAlignment(RIGHT)
     return item
-
-
-def _length(value_mm: float) -> str:
-    """Text of a length to 0.01 mm, as on callipers, or with more digits if entered."""
-    return max(f"{value_mm:.2f}", f"{value_mm:g}", key=len)

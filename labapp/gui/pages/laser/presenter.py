@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import zip_longest
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, parsed
 from labapp.gui.pages.setup.presenter import shown as setup_shown
 from labapp.session.calibrations import calibrations_in_use
+from labapp.session.record import LaserEntries
 from labapp.session.session import Session
 from labapp.text import pluralize
 
@@ -77,6 +79,11 @@ def length_mm(text: str) -> float | None:
     return value if value is not None and value > 0 else None
 
 
+def length_text(value_mm: float) -> str:
+    """Text of a length to 0.01 mm, as on callipers, or with more digits if entered."""
+    return max(f"{value_mm:.2f}", f"{value_mm:g}", key=len)
+
+
 def typed(
     cells: Mapping[tuple[int, int], str],
     fan_angle_deg: float,
@@ -111,6 +118,28 @@ def kept(session: Session) -> Readings | None:
     given = {name: value for name, value in known.items() if value is not None}
     settings = LaserCalibrationSettings(**given)
     return Readings(lengths, calibration.fan_angle_deg, settings)
+
+
+def entries(session: Session) -> LaserEntries:
+    """Entries that are not applied yet; without any, those of the calibration in use."""
+    entered = session.laser_entries
+    if entered is not None:
+        return entered
+    readings = kept(session) or Readings()
+    l1, l2, l3 = (map(length_text, lengths) for lengths in readings.lengths_mm)
+    settings = readings.settings
+    return LaserEntries(
+        tuple(zip_longest(l1, l2, l3, fillvalue="")),
+        readings.fan_angle_deg,
+        settings.fan_angle_sigma_deg,
+        settings.resolution_mm,
+    )
+
+
+def enter(session: Session, entered: LaserEntries) -> None:
+    """Store entries until they are applied, unless the session has them."""
+    if entered != entries(session):
+        session.set_laser_entries(entered)
 
 
 def is_in_use(session: Session, readings: Readings) -> bool:
