@@ -27,7 +27,11 @@ OF_A_RECORDING = ("correction", "signals")
 """Kinds of documents that belong to the recording."""
 
 OF_A_BENCH: tuple[Kind, ...] = (
-    *("setup", "laser-entries", "laser-calibration", "plane-calibration", "bench-check"),
+    "setup",
+    "laser-entries",
+    "laser-calibration",
+    "plane-calibration",
+    "bench-check",
 )
 """Kinds of documents that belong to the bench."""
 
