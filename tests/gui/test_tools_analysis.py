@@ -212,7 +212,7 @@ def test_impossible_input_is_rejected(analysis: AnalysisWindow, window: MainWind
     analysis.sizes["height"].set_value(0.3)
     click(analysis.start_button)
     assert not analysis.working
-    assert "no session is open" in analysis.message.text()
+    assert "no session is open" in analysis.message.text().lower()
     window.workspace.show(Session.create(tmp_path / "empty.labsession"))
     click(analysis.start_button)
     assert not analysis.working

@@ -561,6 +561,7 @@ def test_closing_stops_measuring_and_keeps_finished_frames(
     path = tmp_path / "dark.labsession"
     with Session.open(copy_sample("gtaw")) as sample, Session.create(path) as session:
         session.set_setup(sample.setup_text)
+        session.update_setup({"image_calibration": {"frame_px": None}})
         session.import_recording(tmp_path / "dark.npy")
     plain.files.open(path)
     settle(plain, qtbot)
