@@ -91,7 +91,7 @@ class Task:
     is_lasting: bool
     """Whether it continues when another session is opened."""
     asked_to_stop: bool = False
-    """Whether the operator cancelled it, and is told when it has stopped."""
+    """Whether the operator cancelled it: a message follows when it has stopped."""
 
     @property
     def done(self) -> int:
@@ -108,7 +108,7 @@ class Task:
         self.control.cancelled.set()
 
     def stop(self) -> None:
-        """Cancel it for the operator."""
+        """Cancel it at the operator's request."""
         self.asked_to_stop = True
         self.cancel()
 

@@ -107,12 +107,8 @@ def main() -> int:
                     print(f"{kind} {seed}, frame {number}: {one}", flush=True)
             refused = sum(one.status != "ok" for one in found)
             if refused or len(lost) > 1:
-                why = ", ".join(sorted(set(lost[1:])))
-                print(
-                    f"{kind} {seed}: of {len(found)} frames {refused} refused, {len(lost)} not "
-                    f"tracked {why}",
-                    flush=True,
-                )
+                words = f"of {len(found)} frames {refused} refused, {len(lost)} not tracked"
+                print(f"{kind} {seed}: {words}: {', '.join(sorted(set(lost)))}", flush=True)
             results += found
         wrong += sum(one.is_wrong for one in results)
         print(summary(kind, results), flush=True)

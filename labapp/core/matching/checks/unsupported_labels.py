@@ -108,13 +108,14 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     * its ray made another dot, which has no ray;
     * another ray between the others, which has no dot, made it.
 
-    A ray that lands outside the boundary of the others is unlikely to be reflected. A dot much
-    wider than those around it is two merged dots; a less wide one counts as merged if a ray without
-    a dot is predicted beside it. With few neighbours, at the rim, a label must be nearer to its
-    prediction than elsewhere. One without neighbours may be that of the next ray, since nothing
-    determines its place in the row; nor is one kept beside rays and dots that have none
-    (`_beside_free_dots`). If all labels are farther from their predictions than the uncertainty of
-    dots and surface explains, that uncertainty is increased accordingly.
+    A ray that lands outside the boundary of the others is unlikely to be reflected; so is one at
+    the rim with no dot beside it in its row, or in its column (`LONE_ODDS`). A dot much wider than
+    those around it is two merged dots; a less wide one counts as merged if a ray without a dot is
+    predicted beside it. With few neighbours, at the rim, a label must be nearer to its prediction
+    than elsewhere. One without neighbours may be that of the next ray, since nothing determines its
+    place in the row; nor is one kept beside rays and dots that have none (`_beside_free_dots`). If
+    all labels are farther from their predictions than the uncertainty of dots and surface explains,
+    that uncertainty is increased accordingly.
 
     A false dot shifts the predictions of its neighbours. Of adjacent labels that fail, only the one
     with the largest distance in σ is returned, as the others may pass after its removal.

@@ -300,14 +300,14 @@ class DotsPage(Page):
             self._before = before  # edits before the fit is done are compared as one
         done = self.workspace.attempt(
             lambda session: session.correct({seen.frame: edit()}, f"{label}, frame {seen.frame}"),
-            beside=self._tell_refusal,
+            beside=self._set_refusal,
         )
         if not done:
             self._before = before
             self.draw()
         return done
 
-    def _tell_refusal(self, words: str) -> None:
+    def _set_refusal(self, words: str) -> None:
         self.editor.refusal = words
 
     def _assign(self, what: str, value: float | None) -> None:
