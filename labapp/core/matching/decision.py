@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from labapp.core.matching.checks.hidden_rows import refuse_hidden_rows
+from labapp.core.matching.checks.hidden_rows import lines_before, rays_beside_hidden_rows
 from labapp.core.matching.checks.unexplained import (
     MOST_SCATTERED,
     any_explains,
@@ -41,7 +41,7 @@ from labapp.core.matching.ray_classes import RayClasses
 from labapp.core.surface.level import KnownRays
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
-from labapp.core.values import CannotMeasure, IntArray
+from labapp.core.values import BoolArray, CannotMeasure, IntArray
 
 HIDDEN, FREE, NEAREST = 3, 4, 6
 """The rows are ambiguous if `HIDDEN` of the four dots beside the absent one have no ray, and `FREE`
@@ -129,7 +129,9 @@ def decide(
     best = supported(observed, _without(observed, best, doubtful, fit_settings), fit_settings)
     best = _with_unknown(observed, best, ended.labels, fit_settings)
     _refuse_hidden_marker(observed, best)
-    refuse_hidden_rows(observed, best, fit_settings)
+    best = _without_rays(
+        observed, best, rays_beside_hidden_rows(observed, best, fit_settings), fit_settings
+    )
     known = KnownRays.of(observed.rig, best.ray_states, best.pool.surface.basis, 0.0)
     sigma = best.pool.height_sigma_mm(known.landing_mm)
     refuse_contradicted(replace(known, height_sigma_mm=sigma), best.pool)
@@ -251,14 +253,27 @@ def _without(
     )
 
 
+def _without_rays(
+    observed: Observation, best: Hypothesis, rays: BoolArray, fit_settings: FitSettings
+) -> Hypothesis:
+    """Remove the labels of some rays, shape (rows, columns); their states become unknown."""
+    if not rays.any():
+        return best
+    before = best.labels
+    best = _without(observed, best, before[rays & (before != UNLABELLED)], fit_settings)
+    ray_states = np.where(rays, 0, best.ray_states)
+    return _refitted(observed, replace(best, ray_states=ray_states), fit_settings)
+
+
 def _with_unknown(
     observed: Observation, best: Hypothesis, before: IntArray, fit_settings: FitSettings
 ) -> Hypothesis:
     """Set the rays that lost their label to unknown, and refit: they were fitted as dark."""
-    lost = (before != UNLABELLED) & (best.labels == UNLABELLED)
+    lit = best.labels != UNLABELLED
+    lost = (before != UNLABELLED) & ~lit
     if not lost.any():
         return best
-    ray_states = np.where(lost, 0, best.ray_states)
+    ray_states = np.where(lost | (lines_before(lost, lit) & ~lit), 0, best.ray_states)
     return _refitted(observed, replace(best, ray_states=ray_states), fit_settings)
 
 

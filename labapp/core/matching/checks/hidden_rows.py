@@ -15,25 +15,44 @@ from labapp.core.matching.hypothesis import MISSED_COST, Hypothesis, evaluate_av
 from labapp.core.matching.label_growth import grow_labels
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.surface.pool_fit import FitSettings
-from labapp.core.values import CannotMeasure, FloatArray, IntArray
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
-WIDE_GAP = 1.45
+MOST_FREED = 8
+"""If at most this number of dots are beyond a hidden row, they lose their rays; otherwise the frame
+is refused."""
+
+WIDE_GAP, WIDE_GAP_FEW = 1.45, 1.2
 """A row may be hidden in a gap that exceeds by this factor what follows from the two gaps before
-it, whose ratio changes little on a smooth surface."""
+it, whose ratio changes little on a smooth surface; the second, if few dots are beyond it."""
 
-AHEAD, FEW, AHEAD_FEW = 11.0, 4, 25.0
+AHEAD, AHEAD_FEW = 11.0, 25.0
 """Labels must cost less by the first than with a hidden row, whose dots do not count as missed, or
-by the last if at most `FEW` dots are beyond the gap; in units of χ². Of labels one row off, nine in
-ten led by less, or cost more; of right labels, those of 7 in 1,000 pools with a dip, and of 2 in 84
-of all kinds."""
+by the last if few dots are beyond the gap; in units of χ². Of labels one row off, nine in ten led
+by less than the first, or cost more; of right labels, those of 7 in 1,000 pools with a dip, and of
+2 in 84 of all kinds."""
 
 
-def refuse_hidden_rows(observed: Observation, best: Hypothesis, fit_settings: FitSettings) -> None:
-    """Raise ``ambiguous-rows`` if the labels cost less with a row or column hidden between them."""
-    for axis, inner, outer in _wide_gaps(observed, best.labels):
+def rays_beside_hidden_rows(
+    observed: Observation, best: Hypothesis, fit_settings: FitSettings
+) -> BoolArray:
+    """Mask of the rays whose state depends on whether a row or column is hidden before the last.
+
+    They are those of the row that may be hidden, and those that the dots beyond it have in either
+    case. Shape (rows, columns).
+
+    Raises
+    ------
+    CannotMeasure
+        ``ambiguous-rows`` if more than `MOST_FREED` dots are beyond it.
+    """
+    in_doubt = np.zeros(best.labels.shape, dtype=bool)
+    for axis, inner, outer, width in _wide_gaps(observed, best.labels):
         labels = _moved_outwards(best.labels, axis, inner, outer)
         own = evaluate_averaged(observed, best.labels, fit_settings, best.pool)
         if labels is None or own is None:
+            continue
+        few = np.count_nonzero(labels != best.labels) <= 2 * MOST_FREED
+        if not few and width < WIDE_GAP:
             continue
         # Dots farther out may have a ray then.
         grown = grow_labels(observed, labels) if best.stray_count else None
@@ -41,14 +60,37 @@ def refuse_hidden_rows(observed: Observation, best: Hypothesis, fit_settings: Fi
         cost = min(
             _cost_if_hidden(observed, each, best, axis, outer, fit_settings) for each in rivals
         )
-        moved = np.count_nonzero((labels != best.labels) & (labels != UNLABELLED))
-        if cost < own.cost + (AHEAD_FEW if moved <= FEW else AHEAD):
+        if cost >= own.cost + (AHEAD_FEW if few else AHEAD):
+            continue
+        if not few:
             line = "row" if axis == 0 else "column"
             raise CannotMeasure(
                 "ambiguous-rows",
                 f"a {line} of dots seems to be hidden beside {line} {inner + 1} of the rays: "
                 "number rows and columns by hand",
             )
+        for each in rivals:
+            in_doubt |= each != best.labels
+        lines = in_doubt if axis == 0 else in_doubt.T
+        lines[outer] = True
+    return in_doubt
+
+
+def lines_before(lost: BoolArray, lit: BoolArray) -> BoolArray:
+    """Mask of the rows and columns that are hidden if doubtful dots beyond them are not false.
+
+    A ray that lost its label is beyond a row (or column) if, in its column (or row), the next ray
+    has no dot and the one after it has one. All masks have shape (rows, columns).
+    """
+    hidden = np.zeros_like(lit)
+    for axis in (0, 1):
+        for step in (1, -1):
+            across, doubtful, labelled = (
+                each[::step] if axis == 0 else each.T[::step] for each in (hidden, lost, lit)
+            )
+            beyond = doubtful[:-2] & ~(doubtful | labelled)[1:-1] & labelled[2:]
+            across[1:-1] |= np.any(beyond, axis=1, keepdims=True)
+    return hidden
 
 
 def _cost_if_hidden(
@@ -72,10 +114,11 @@ def _cost_if_hidden(
     return rival.cost - MISSED_COST * np.count_nonzero(rival.missed_rays[:, axis] == hidden)
 
 
-def _wide_gaps(observed: Observation, labels: IntArray) -> Iterator[tuple[int, int, int]]:
-    """Axis, and the rows (or columns) before and after each gap in which one may be hidden.
+def _wide_gaps(observed: Observation, labels: IntArray) -> Iterator[tuple[int, int, int, float]]:
+    """Gaps in which a row or column may be hidden, from the marker outwards.
 
-    Gaps are followed from the marker outwards; numbers are counted from 0.
+    Axis, the rows (or columns) before and after the gap, counted from 0, and its width as a
+    multiple of the expected one.
     """
     marker = observed.rig.pattern.marker
     assert marker is not None
@@ -90,9 +133,10 @@ def _wide_gaps(observed: Observation, labels: IntArray) -> Iterator[tuple[int, i
             for k in range(max(first, 1), len(along)):
                 before = along[k - 1]
                 far = along[k - 2] if k > 1 and np.isfinite(along[k - 2]) else before
-                if along[k] > WIDE_GAP * before * before / far:
+                width = float(along[k] * far / before**2)
+                if width > WIDE_GAP_FEW:
                     inner = k if step > 0 else len(gaps) - k
-                    yield axis, inner, inner + step
+                    yield axis, inner, inner + step, width
 
 
 def _gaps(place: FloatArray) -> FloatArray:
