@@ -82,26 +82,22 @@ def _plate(
 
 
 def _cap(diameter: tuple[float, float | None], height: tuple[float, float | None]) -> Cap:
-    usual = Cap(diameter[0], height[0])
     if not 0 < height[0] <= diameter[0] / 2:
         raise ValueError
     return Cap(
         diameter[0],
         height[0],
-        diameter[1] or usual.diameter_sigma_mm,
-        height[1] or usual.height_sigma_mm,
+        diameter[1] or Cap.diameter_sigma_mm,
+        height[1] or Cap.height_sigma_mm,
     )
 
 
 def _ball(
     diameter: tuple[float, float | None], top: tuple[float, float | None] | None = None
 ) -> Ball:
-    usual = Ball(diameter[0])
-    if not diameter[0] > 0 or (top is not None and not 0 < top[0] <= 2 * diameter[0]):
+    height, sigma = top or (diameter[0], None)
+    if not 0 < height <= 2 * diameter[0]:
         raise ValueError
     return Ball(
-        diameter[0],
-        None if top is None else top[0],
-        diameter[1] or usual.diameter_sigma_mm,
-        (top and top[1]) or usual.top_sigma_mm,
+        diameter[0], height, diameter[1] or Ball.diameter_sigma_mm, sigma or Ball.height_sigma_mm
     )

@@ -382,7 +382,7 @@ def test_single_mirror_in_a_rendered_picture_is_measured(kind: str, seed: int):
     x, y = rng.uniform(-0.6, 0.6, 2)
     steep = np.tan(np.radians(RIG.laser.projection_angle_deg))
     mirror, surface = {
-        "ball": (Ball(10.0), BallMirror(10.0, 10.0, (x, 10.0 / steep + y))),
+        "ball": (Ball(10.0, 10.0), BallMirror(10.0, 10.0, (x, 10.0 / steep + y))),
         "sunk ball": (Ball(10.0, 2.0), BallMirror(10.0, 2.0, (x, 2.0 / steep + y))),
         "thumb tack": (Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (x, y))),
     }[kind]
@@ -426,7 +426,7 @@ def test_forecast_uncertainty_falls_with_each_picture():
         ("plate:0+-0.01:0.05", Plate(0.0, 0.01, 0.05)),
         ("cap:9.75±0.05:0.91", Cap(9.75, 0.91, 0.05)),
         ("ball:10:1.2", Ball(10.0, 1.2)),
-        ("ball:10", Ball(10.0)),
+        ("ball:10", Ball(10.0, 10.0)),
     ],
 )
 def test_mirror_text_round_trip(text: str, mirror: Mirror):

@@ -9,7 +9,7 @@ import numpy as np
 
 from labapp.core.bench_check.adjustment import MOST_ITERATIONS, Sighting, System
 from labapp.core.bench_check.check import BenchCheck, adjusted_bench
-from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points, placed
+from labapp.core.bench_check.mirrors import Cap, Mirror, Plate, landing_points, placed
 from labapp.core.bench_check.suspects import freed_directions
 from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import Rig
@@ -136,7 +136,9 @@ def _misled(check: BenchCheck, k: int, error_mm: float, pool: Cap) -> float:
 
     0 if the pool could not be measured, as no wrong result would be given.
     """
-    wrong = replace(check.sightings[k], mirror=_raised(check.sightings[k].mirror, error_mm))
+    mirror = check.sightings[k].mirror
+    raised = replace(mirror, height_mm=mirror.height_mm + error_mm)
+    wrong = replace(check.sightings[k], mirror=raised)
     sightings = [wrong if n == k else one for n, one in enumerate(check.sightings)]
     system = System.of(check.before, sightings, freed_directions(check.before, check.free))
     made, unknown = check.adjustment, check.adjustment.unknown.copy()
@@ -156,13 +158,6 @@ def _misled(check: BenchCheck, k: int, error_mm: float, pool: Cap) -> float:
     except CannotMeasure:
         return 0.0
     return found - right
-
-
-def _raised(mirror: Mirror, by_mm: float) -> Mirror:
-    """Return the mirror with its given height raised."""
-    if isinstance(mirror, Ball):
-        return replace(mirror, top_mm=float(mirror.pose[2]) + by_mm)
-    return replace(mirror, height_mm=mirror.height_mm + by_mm)
 
 
 def expected_sighting(mirror: Mirror, rig: Rig) -> Sighting | None:

@@ -164,11 +164,6 @@ def _loosened(mirror: Mirror) -> Mirror:
     """Return the mirror with large uncertainties of its sizes."""
     if isinstance(mirror, Plate):
         return replace(mirror, height_sigma_mm=LOOSE_PLATE_MM)
-    if isinstance(mirror, Cap):
-        return replace(
-            mirror,
-            height_sigma_mm=LOOSE * mirror.height_mm,
-            diameter_sigma_mm=LOOSE * mirror.diameter_mm,
-        )
     wide = LOOSE * mirror.diameter_mm
-    return replace(mirror, top_sigma_mm=wide, diameter_sigma_mm=wide)
+    height = LOOSE * mirror.height_mm if isinstance(mirror, Cap) else wide
+    return replace(mirror, height_sigma_mm=height, diameter_sigma_mm=wide)

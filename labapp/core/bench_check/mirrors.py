@@ -90,7 +90,33 @@ class Plate:
 
 
 @dataclass(frozen=True)
-class Cap:
+class _Sphere:
+    """Part of a sphere, by its diameter and the height of its top over the work piece."""
+
+    diameter_mm: float
+    height_mm: float
+    diameter_sigma_mm: float = 0.02
+    height_sigma_mm: float = 0.005
+    place_mm: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Place and height of its top, and diameter."""
+        return ("x_mm", "y_mm", "height_mm", "diameter_mm")
+
+    @property
+    def pose(self) -> FloatArray:
+        """Expected pose, shape (d,)."""
+        return np.array([*self.place_mm, self.height_mm, self.diameter_mm])
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard uncertainty of each parameter, shape (d,)."""
+        return np.array([FREE_MM, FREE_MM, self.height_sigma_mm, self.diameter_sigma_mm])
+
+
+@dataclass(frozen=True)
+class Cap(_Sphere):
     """A cap of a sphere on the work piece: a thumb tack, or a lens's face.
 
     Parameters
@@ -99,32 +125,14 @@ class Cap:
         Diameter of its rim, which lies on the work piece, and height of its top.
     diameter_sigma_mm, height_sigma_mm
         Standard uncertainties of these; the defaults are those of a caliper and a dial gauge.
+    place_mm
+        Expected X and Y of its top.
     """
-
-    diameter_mm: float
-    height_mm: float
-    diameter_sigma_mm: float = 0.02
-    height_sigma_mm: float = 0.005
 
     @property
     def name(self) -> str:
         """The mirror in a few words."""
         return f"cap ⌀ {self.diameter_mm:g} mm, {self.height_mm:g} mm high"
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Place of its top, height and diameter."""
-        return ("x_mm", "y_mm", "height_mm", "diameter_mm")
-
-    @property
-    def pose(self) -> FloatArray:
-        """Expected pose, shape (d,)."""
-        return np.array([0.0, 0.0, self.height_mm, self.diameter_mm])
-
-    @property
-    def sigma(self) -> FloatArray:
-        """Standard uncertainty of each parameter, shape (d,)."""
-        return np.array([FREE_MM, FREE_MM, self.height_sigma_mm, self.diameter_sigma_mm])
 
     def meet(
         self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
@@ -139,48 +147,26 @@ class Cap:
 
 
 @dataclass(frozen=True)
-class Ball:
+class Ball(_Sphere):
     """A bearing ball, on the work piece or sunk into it.
 
     Parameters
     ----------
-    diameter_mm
-        Its diameter.
-    top_mm
-        Height of its top over the work piece. None: the ball lies on the work piece, and the height
-        is the diameter.
-    diameter_sigma_mm, top_sigma_mm
+    diameter_mm, height_mm
+        Its diameter, and height of its top: the diameter if it lies on the work piece.
+    diameter_sigma_mm, height_sigma_mm
         Standard uncertainties of these.
     place_mm
         Expected X and Y of its top, see `placed`.
     """
 
-    diameter_mm: float
-    top_mm: float | None = None
     diameter_sigma_mm: float = 0.002
-    top_sigma_mm: float = 0.01
-    place_mm: tuple[float, float] = (0.0, 0.0)
+    height_sigma_mm: float = 0.01
 
     @property
     def name(self) -> str:
         """The mirror in a few words."""
-        return f"ball ⌀ {self.diameter_mm:g} mm, top at {self.pose[2]:g} mm"
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Place and height of its top, and diameter."""
-        return ("x_mm", "y_mm", "height_mm", "diameter_mm")
-
-    @property
-    def pose(self) -> FloatArray:
-        """Expected pose, shape (d,)."""
-        top = self.diameter_mm if self.top_mm is None else self.top_mm
-        return np.array([*self.place_mm, top, self.diameter_mm])
-
-    @property
-    def sigma(self) -> FloatArray:
-        """Standard uncertainty of each parameter, shape (d,)."""
-        return np.array([FREE_MM, FREE_MM, self.top_sigma_mm, self.diameter_sigma_mm])
+        return f"ball ⌀ {self.diameter_mm:g} mm, top at {self.height_mm:g} mm"
 
     def meet(
         self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
@@ -201,7 +187,7 @@ def placed(mirror: Mirror, rig: Rig) -> Mirror:
     if not isinstance(mirror, Ball):
         return mirror
     laser = rig.laser
-    x, y, _ = intersect_level(laser.position_mm, laser.axes[0], float(mirror.pose[2])).tolist()
+    x, y, _ = intersect_level(laser.position_mm, laser.axes[0], mirror.height_mm).tolist()
     return replace(mirror, place_mm=(x, y))
 
 

@@ -89,7 +89,7 @@ def test_uncertainty_of_a_mirror_is_entered() -> None:
     known = replace(one, height_sigma_mm=0.005, level_sigma_deg=0.03)
     assert known.mirror == Plate(0.0, 0.005, 0.03)
     ball = replace(one.of_kind("ball"), height_sigma_mm=0.005)
-    assert ball.mirror == Ball(10.0, 10.0, top_sigma_mm=0.005)
+    assert ball.mirror == Ball(10.0, 10.0, height_sigma_mm=0.005)
     assert known.of_kind("cap").mirror == Cap(9.75, 0.91)
 
 

@@ -39,7 +39,7 @@ class ListedPicture:
     """Standard uncertainty of a plate's level; None: the usual one."""
 
     @property
-    def usual_mirror(self) -> Plate | Cap | Ball:
+    def usual_mirror(self) -> Mirror:
         """The mirror with usual uncertainties."""
         if self.kind == "plate" or self.diameter_mm is None:
             return Plate(self.height_mm)
@@ -56,13 +56,12 @@ class ListedPicture:
     @property
     def mirror(self) -> Mirror:
         """The mirror."""
-        usual, sigma, level = self.usual_mirror, self.height_sigma_mm, self.level_sigma_deg
-        if isinstance(usual, Ball):
-            return usual if sigma is None else replace(usual, top_sigma_mm=sigma)
-        known = usual if sigma is None else replace(usual, height_sigma_mm=sigma)
-        if isinstance(known, Plate) and level is not None:
-            return replace(known, tilt_sigma_deg=level)
-        return known
+        made = self.usual_mirror
+        if self.height_sigma_mm is not None:
+            made = replace(made, height_sigma_mm=self.height_sigma_mm)
+        if self.level_sigma_deg is not None and isinstance(made, Plate):
+            made = replace(made, tilt_sigma_deg=self.level_sigma_deg)
+        return made
 
     @property
     def mirror_words(self) -> str:
