@@ -88,14 +88,6 @@ class MarkFit(ReadOnlyArrays):
         rows = _jacobian(self.matrix, plane_mm)[:, self.free]
         return np.asarray(rows @ self.covariance @ rows.T)
 
-    def moved(self) -> list[ImageCalibration]:
-        """Calibrations displaced by one σ along each principal axis of the covariance."""
-        # In units of each entry's own σ: the entries differ by orders of magnitude.
-        scale = np.sqrt(np.diag(self.covariance))
-        power, way = np.linalg.eigh(self.covariance / np.outer(scale, scale))
-        steps = (way * np.sqrt(np.maximum(power, 0.0))).T * scale
-        return [_calibration(_with(self.matrix, self.free, step)) for step in steps]
-
 
 @dataclass(frozen=True)
 class MarkFits:

@@ -278,11 +278,6 @@ class GenicamCamera(Camera):
         """Take a frame now."""
         self._ask("software_trigger")
 
-    @property
-    def dropped(self) -> int:
-        """Always 0: the frame numbers show all lost frames."""
-        return 0
-
     def stop(self) -> None:
         """Stop acquisition."""
         stream, self._stream = self._stream, None

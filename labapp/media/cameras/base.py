@@ -172,7 +172,7 @@ class Camera(Protocol):
     @property
     def dropped(self) -> int:
         """Frames since `start` that camera or driver dropped without a gap in the numbers."""
-        ...
+        return 0
 
     def stop(self) -> None:
         """Stop acquisition, after which settings may be changed. May be called twice."""

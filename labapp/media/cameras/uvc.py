@@ -202,11 +202,6 @@ class UvcCamera(Camera):
         """Raise, as triggers are not supported."""
         raise CameraError(f"{self.info.name} is free-running only")
 
-    @property
-    def dropped(self) -> int:
-        """Always 0, as the driver does not report dropped frames."""
-        return 0
-
     def stop(self) -> None:
         """Stop acquisition."""
         self._running = False

@@ -82,7 +82,7 @@ class SpaceMouse(HidReader):
         find: Find = find_hid,
         opener: Open = open_hid,
     ) -> None:
-        self._on_move, self._on_event = on_move, on_event
+        self._on_move = on_move
         self._state = SixAxes()
         super().__init__("3-D controller", on_event, find, opener, RETRY_S)
 
