@@ -13,30 +13,13 @@ TITLE = "First use: compiling for this computer, two to four minutes"
 
 POLL_S = 0.2
 
+_PACKAGE = Path(__file__).parents[1]
+
 COMPILED = (
     *(
-        f"labapp.core.images.{name}_kernels"
-        for name in ("centroid", "band_pass", "dot_fit", "size")
+        ".".join(("labapp", *file.relative_to(_PACKAGE).with_suffix("").parts))
+        for file in sorted(_PACKAGE.glob("core/**/*_kernels.py"))
     ),
-    "labapp.core.rows.lattice_kernels",
-    "labapp.core.rows.jump_kernels",
-    *(
-        f"labapp.core.surface.kernels.{name}_kernels"
-        for name in (
-            "spline",
-            "ray",
-            "solver",
-            "boundary",
-            "level",
-            "rounds",
-            "fit",
-            "setup",
-            "shape",
-        )
-    ),
-    "labapp.core.matching.match_kernels",
-    "labapp.core.matching.initial.quadric_kernels",
-    "labapp.core.lines.detection.ridge_kernels",
     "labapp.core.sequence.prior",
     "labapp.export.fixed_point",
 )
