@@ -39,13 +39,6 @@ NORM_OFF = 0.01
 def text_with_rays(text: str, path: Path, values: Mapping[str, Any]) -> str:
     """Text of a setup file in which the named table is replaced by its rays.
 
-    Parameters
-    ----------
-    text, path
-        The setup file.
-    values
-        Its tables.
-
     Raises
     ------
     InputError
@@ -82,8 +75,6 @@ def read_rays(path: Path, setup: Mapping[str, Any]) -> tuple[IntArray, FloatArra
 
     Parameters
     ----------
-    path
-        The table.
     setup
         Tables of the setup file: directions in the UCS require the beam axis and the rotation.
 

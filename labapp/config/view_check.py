@@ -34,12 +34,8 @@ def view_problems(
 
     Parameters
     ----------
-    path
-        The setup file, for the errors.
     values
         Its values: section → key → value.
-    calibration
-        The image calibration of these values.
     """
     keys, plane = values["image_calibration"], values["imaging_plane"]
     size = np.array([plane["width_mm"], plane["height_mm"]])

@@ -35,8 +35,6 @@ class Trial:
 
     Parameters
     ----------
-    orientation
-        The orientation.
     residual_mm
         Root mean square distance between computed and captured dots, mm; infinite if no surface
         has this orientation.
@@ -52,8 +50,6 @@ class Match(ReadOnlyArrays):
 
     Parameters
     ----------
-    orientation
-        The selected orientation.
     dot
         Index of each pair's dot in `Dots`, shape (n,).
     ray

@@ -138,13 +138,7 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class OpenMeasurement(Measurement):
-    """An ``ambiguous-rows`` frame, whose rows other frames of the recording may determine.
-
-    Parameters
-    ----------
-    candidates
-        Possible matches.
-    """
+    """An ``ambiguous-rows`` frame, whose rows other frames of the recording may determine."""
 
     candidates: tuple[Candidate, ...]
 
@@ -154,13 +148,7 @@ class OpenMeasurement(Measurement):
         return Measurement(**{each.name: getattr(self, each.name) for each in fields(Measurement)})
 
     def decided(self, match: Match, rig: Rig, settings: Settings) -> Measurement:
-        """Complete the measurement with the match of one of the candidates.
-
-        Parameters
-        ----------
-        match, rig, settings
-            Match to use, rig and settings of the measurement.
-        """
+        """Complete the measurement with the match of one of the candidates."""
         assert self.dots is not None
         lattice = lattice_of_match(match, rig, len(self.dots))
         result = replace(self.refused, status="ok", reason="", lattice=lattice, match=match)

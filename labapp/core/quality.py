@@ -44,10 +44,6 @@ class Remark:
 
     Parameters
     ----------
-    about
-        Property.
-    grade
-        Its grade.
     words
         Description and remedy, one or two sentences.
     """

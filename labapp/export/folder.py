@@ -186,8 +186,6 @@ def export(
         Pixel ↔ imaging plane, for the dots' positions on the plane.
     provenance
         Source, set-up and settings, for the manifest and for files of all frames; plain values.
-    choice
-        Contents of the export.
     image_of
         Reads a frame's grey levels; needed for pictures of frames.
     extras

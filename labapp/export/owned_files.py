@@ -42,11 +42,6 @@ def check_owned(folder: Path, command: str, names: Collection[str] = ()) -> None
 def check_added(folder: Path, command: str, names: Collection[str]) -> None:
     """Check that a command may write files beside its earlier ones; others are not looked at.
 
-    Parameters
-    ----------
-    folder, command, names
-        See `check_owned`.
-
     Raises
     ------
     InputError
@@ -80,8 +75,6 @@ def write_owned(folder: Path, command: str, files: Mapping[str, bytes]) -> None:
 
     Parameters
     ----------
-    folder, command
-        See `check_owned`.
     files
         File name → content.
 
@@ -100,11 +93,6 @@ def write_owned(folder: Path, command: str, files: Mapping[str, bytes]) -> None:
 
 def add_owned(folder: Path, command: str, files: Mapping[str, bytes]) -> None:
     """Write files beside a command's earlier ones, and record their checksums with those.
-
-    Parameters
-    ----------
-    folder, command, files
-        See `write_owned`.
 
     Raises
     ------

@@ -260,8 +260,6 @@ def prediction_csv(name: str, model: PenetrationModel, found: Mapping[str, Predi
 
     Parameters
     ----------
-    name
-        Name of the model.
     found
         Predictions by the recording's name.
     """
@@ -287,10 +285,6 @@ class Predictor:
 
     Parameters
     ----------
-    name
-        Name of the model.
-    model
-        The model.
     keeps
         Whether to store all predictions for `predictions`.
     """

@@ -56,8 +56,6 @@ def survey(source: FrameSource, progress: Callable[[int, int], None] | None = No
 
     Parameters
     ----------
-    source
-        The recording.
     progress
         Called with the number of frames done and the total; may raise to stop.
     """

@@ -44,8 +44,6 @@ class LiveWatch:
 
     Parameters
     ----------
-    setup, settings, bit_depth
-        As for `LiveMeasuring`.
     on_event
         Called when an alarm is raised, over, or acknowledged, when limits or the set-up change, and
         when measuring ends because of an error, with the event and the time of its frame by the

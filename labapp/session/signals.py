@@ -150,8 +150,6 @@ def read_signals(
 
     Parameters
     ----------
-    path
-        The file.
     full_scale
         For WAV: full scale of the first, second and third channel, A, V and m/min.
 

@@ -100,8 +100,6 @@ def trace(pool: PoolSurface, rig: Rig, torch: Torch | None = None) -> Reflection
 
     Parameters
     ----------
-    pool, rig
-        The reflecting pool and the bench.
     torch
         The torch that blocks rays. None: all rays above the rig's electrode tip are blocked
         (`YozTorch`).

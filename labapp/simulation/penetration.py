@@ -66,15 +66,7 @@ class SimulatedWeld:
 
 
 def simulate_welds(count: int, seed: int) -> list[SimulatedWeld]:
-    """Simulate welds whose current changes at random times between random values.
-
-    Parameters
-    ----------
-    count
-        Number of welds.
-    seed
-        Seed of the random numbers.
-    """
+    """Simulate welds whose current changes at random times between random values."""
     rng = np.random.default_rng(seed)
     return [_weld(f"weld_{k:02d}", rng) for k in range(1, count + 1)]
 

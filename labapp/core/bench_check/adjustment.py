@@ -68,8 +68,6 @@ class Sighting(ReadOnlyArrays):
 
     Parameters
     ----------
-    mirror
-        The mirror.
     ray
         Row and column of each dot's ray in the pattern's arrays, counted from 0, shape (n, 2).
     plane_mm, covariance_mm2
@@ -159,8 +157,6 @@ def adjust(
     ----------
     rig
         The bench before the check; its uncertainty is the prior.
-    sightings
-        The mirrors and their dots.
     freed
         Directions in the space of the bench's quantities along which the prior is widened by their
         length, shape (k, q).

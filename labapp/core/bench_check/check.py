@@ -58,8 +58,6 @@ class CheckedPicture(ReadOnlyArrays):
 
     Parameters
     ----------
-    picture
-        The picture.
     dot
         Index of each pair's dot in the picture's dots, shape (n,).
     ray
@@ -68,8 +66,6 @@ class CheckedPicture(ReadOnlyArrays):
         The dot by the set-up before the check, IPCS, shape (n, 2), mm.
     residual_mm
         Observed minus computed dot, shape (n, 2), mm.
-    sizes
-        The mirror's sizes, known and measured.
     """
 
     picture: MirrorDots

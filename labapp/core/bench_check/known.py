@@ -77,15 +77,7 @@ class MeasuredSize:
 def measure_sizes(
     rig: Rig, sightings: Sequence[Sighting], freed: FloatArray, made: Adjustment
 ) -> tuple[tuple[MeasuredSize, ...], ...]:
-    """Measure the sizes of each mirror: its height, preceded by the radius of a ball or cap.
-
-    Parameters
-    ----------
-    rig, sightings, freed
-        What was adjusted, see `adjust`.
-    made
-        The adjustment.
-    """
+    """Measure the sizes of each mirror: its height, preceded by the radius of a ball or cap."""
     every = []
     for k, sighting in enumerate(sightings):
         mirror = sighting.mirror

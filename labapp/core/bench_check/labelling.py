@@ -68,10 +68,6 @@ class MirrorDots:
 
     Parameters
     ----------
-    name
-        Name of the picture, for messages.
-    mirror
-        The mirror in the picture.
     dots
         Dots from `find_dots`.
     frame_shape
@@ -110,15 +106,6 @@ def label_picture(
     freed: FloatArray | None = None,
 ) -> Labelled:
     """Assign a ray to every dot of a picture.
-
-    Parameters
-    ----------
-    picture
-        The picture.
-    rig, calibration
-        The set-up before the check.
-    freed
-        See `adjust`.
 
     Raises
     ------

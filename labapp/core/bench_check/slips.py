@@ -44,15 +44,6 @@ def slip_cost_fall(
 
     Dots without a ray cost as in `label_picture`. An alternative is excluded at once if its
     additional stray dots cost more than could be gained.
-
-    Parameters
-    ----------
-    rig, freed
-        What was adjusted, see `adjust`.
-    seen
-        Each picture's dots, mirror and labels.
-    made
-        The adjustment to these.
     """
     strays = _strays(seen)
     prior = float(made.unknown @ made.unknown)

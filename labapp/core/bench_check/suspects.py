@@ -52,8 +52,6 @@ class Suspect:
     key
         Its key (`Quantity.key`), or ``picture.u``, ``picture.v``, ``picture.scale`` for the whole
         of the image calibration.
-    name
-        Its name.
     cost_fall
         Reduction of the cost if it is free: the square of its deviation in standard deviations.
     """
@@ -87,15 +85,6 @@ def find_suspects(
 
     Quantities that explain the dots equally well are returned together, as the pictures cannot
     distinguish them. Empty if none is suspected.
-
-    Parameters
-    ----------
-    rig, sightings
-        The bench before the check, and the mirrors' dots.
-    made
-        The adjustment to these.
-    freed
-        Directions free in it, see `freed_directions`.
     """
     every = {one.key: one for one in directions(rig)}
     system = System.of(rig, sightings, freed)

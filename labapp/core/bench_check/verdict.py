@@ -43,8 +43,6 @@ class ResidualPattern:
 
     Parameters
     ----------
-    cause
-        The cause.
     cost_fall
         Reduction of the cost, in units of χ².
     rms_mm
@@ -59,15 +57,7 @@ class ResidualPattern:
 def judge(
     rig: Rig, sightings: Sequence[Sighting], made: Adjustment, freed: FloatArray
 ) -> tuple[ResidualVerdict, tuple[ResidualPattern, ...]]:
-    """Classify the residuals of an adjustment: the verdict, and the patterns, the likeliest first.
-
-    Parameters
-    ----------
-    rig, sightings, freed
-        What was adjusted, see `adjust`.
-    made
-        The adjustment.
-    """
+    """Classify the residuals of an adjustment: verdict, and patterns, the likeliest first."""
     system = System.of(rig, sightings, freed)
     left = float(np.sum(made.weight * (made.standardised / made.scale) ** 2))
     size = np.sqrt(np.mean(np.concatenate([r.ravel() for r in made.residual_mm]) ** 2))

@@ -46,8 +46,6 @@ class Board:
 
     Parameters
     ----------
-    name
-        Name of the board.
     kind
         ``charuco``, with markers in the white squares, or ``chessboard``.
     columns, rows
@@ -161,8 +159,6 @@ class BoardCorners(ReadOnlyArrays):
 
     Parameters
     ----------
-    board
-        The board.
     index
         Index of each corner in `Board.corners_mm`, shape (n,).
     image_px

@@ -62,12 +62,8 @@ class Dynamics:
 
     Parameters
     ----------
-    surfaces
-        The analysed surfaces.
     series
         Sizes and shape of each, name → values, shape (n,).
-    settings
-        Settings of the analysis.
     modes, pod
         Bessel modes and POD modes.
     spectrogram, peak

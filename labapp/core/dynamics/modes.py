@@ -186,8 +186,6 @@ def bessel_modes(
 
     Parameters
     ----------
-    series
-        The surfaces of a recording.
     scale_sigma
         Relative standard uncertainty of heights due to the set-up, common to all frames; it is
         added to the noise in the ± of amplitudes.

@@ -55,8 +55,6 @@ class ModelSettings:
         Names of the features and of the predicted quantity.
     step_s
         Time step over which features are averaged, s.
-    orders
-        Orders of the dynamics.
     full_mm
         Threshold of full penetration; None: unknown.
     """
@@ -104,16 +102,12 @@ class PenetrationModel(ReadOnlyArrays):
 
     Parameters
     ----------
-    kind, settings
-        Kind and settings of the model.
     time_constants_s
         Time constants of A(q).
     center, scale
         Offset and scale that standardise the regressors, shape (d,).
     low, high
         Range of the regressors to which it was fitted, shape (d,).
-    mean_mm
-        Mean penetration.
     static
         Map from standardised regressors to penetration.
     scatter_mm

@@ -60,8 +60,6 @@ class Spectrogram(ReadOnlyArrays):
         Shape (f,), Hz.
     density
         Shape (s, f), unit²/Hz; each has two degrees of freedom.
-    method
-        Method of estimation.
     segment_s
         Duration of a segment, s.
     """

@@ -16,15 +16,7 @@ from labapp.core.values import FloatArray
 
 @dataclass(frozen=True)
 class Bench:
-    """A rig and the image calibration of its imaging plane.
-
-    Parameters
-    ----------
-    rig
-        Laser, pattern, electrode and imaging plane.
-    calibration
-        Mapping between the image and the imaging plane.
-    """
+    """A rig and the image calibration of its imaging plane."""
 
     rig: Rig
     calibration: ImageCalibration

@@ -67,8 +67,6 @@ def image_sigma(
 
     Parameters
     ----------
-    plane, mirror
-        Imaging plane and mirror.
     sigma
         Standard uncertainty of the plane's pose (`ImagingPlane.pose`), shape (6,).
     mirror_sigma

@@ -25,8 +25,6 @@ class LinePattern:
 
     Parameters
     ----------
-    count
-        Number of lines.
     interline_angle_deg
         Angle γ between neighbouring lines at the centre, degrees.
     fan_angle_deg
@@ -69,13 +67,7 @@ RAYS_A_LINE = 41
 
 @dataclass(frozen=True)
 class LineRays(DotPattern):
-    """A line pattern as rays, one row for each line, for drawings and for counts of rays.
-
-    Parameters
-    ----------
-    lines
-        The pattern.
-    """
+    """A line pattern as rays, one row for each line, for drawings and for counts of rays."""
 
     lines: LinePattern = field(default_factory=LinePattern)
 
@@ -99,13 +91,7 @@ class LineRays(DotPattern):
 
 @dataclass(frozen=True)
 class LineRig:
-    """A rig with a line pattern.
-
-    Parameters
-    ----------
-    laser, pattern, electrode, imaging_plane
-        Its components.
-    """
+    """A rig with a line pattern."""
 
     laser: Laser
     pattern: LinePattern

@@ -85,8 +85,6 @@ def direction_to_dots(
     ----------
     point_mm, plane_mm
         Starting points, UCS, shape (…, 3), and dots, IPCS, shape (…, 2), mm.
-    plane
-        The imaging plane.
     """
     way = plane.to_universal(plane_mm) - point_mm
     if not plane.glass_mm:

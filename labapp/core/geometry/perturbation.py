@@ -40,8 +40,6 @@ class Direction(ReadOnlyArrays):
     key
         Key of the quantity (`Quantity.key`), or ``picture.u``, ``picture.v``, ``picture.scale`` for
         the image calibration as a whole.
-    name, unit
-        Name and unit.
     vector
         Offset of the quantities per unit, shape (q,).
     """

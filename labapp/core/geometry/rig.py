@@ -304,8 +304,6 @@ class Rig:
 
     Parameters
     ----------
-    laser, pattern, electrode, imaging_plane
-        Components.
     uncertainty
         Their uncertainty; None: exactly known.
     travel

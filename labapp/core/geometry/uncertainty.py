@@ -24,8 +24,6 @@ class Quantity:
     ----------
     key
         ``section.key`` of the setup file; ``[u]`` or ``[v]`` follows for a point in the picture.
-    name, unit
-        Name and unit.
     assumed
         Standard uncertainty assumed if none is given: tape, protractor and reading of the picture.
     """

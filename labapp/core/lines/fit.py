@@ -161,8 +161,6 @@ def fit_lines(data: LineData, numberings: list[FloatArray], rig: LineRig) -> Lin
         Points and ends of the lines, on the imaging plane.
     numberings
         Possible numbers of the lines, from the lowest up, each shape (k,).
-    rig
-        The bench.
 
     Raises
     ------

@@ -75,8 +75,6 @@ class LineFrame:
         line: ``followed``, ``pulse``, ``line-lost``.
     reason
         One sentence if there is no surface; empty otherwise.
-    seen, features
-        The lines and their features.
     surface
         The fitted surface; a measurement only if the status is ``ok``.
     track, pulse

@@ -95,8 +95,6 @@ class LineModel:
 
     Parameters
     ----------
-    rig
-        The bench.
     basis
         The p splines of the surface.
     numbers

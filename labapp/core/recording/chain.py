@@ -23,8 +23,6 @@ class WarmChain:
 
     Parameters
     ----------
-    bench
-        The bench.
     settings
         Settings of the measurement. Only the fit to band-passed dots, the default, can be tracked.
     on_step

@@ -169,13 +169,7 @@ class Residuals(ReadOnlyArrays):
 
 @dataclass
 class ResidualRecord:
-    """Residuals of a sample of a recording's frames, for the verdict on its set-up.
-
-    Parameters
-    ----------
-    rig
-        The rig with which the frames are measured.
-    """
+    """Residuals of a sample of a recording's frames, for the verdict on its set-up."""
 
     rig: Rig
     _samples: list[Residuals] = field(default_factory=list)
@@ -261,10 +255,6 @@ def judge_setup(
 
     Parameters
     ----------
-    rig
-        The rig with which the frames were measured.
-    statuses
-        Number of frames with each status.
     samples
         Residuals of frames, evenly spaced over the recording, in order.
     """

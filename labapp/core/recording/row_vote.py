@@ -51,8 +51,6 @@ class Ballot:
 
     Parameters
     ----------
-    measured
-        Measurement of the frame.
     at
         Shift of its rays from those of the first frame, in rows and columns; None without a
         surface.
@@ -71,15 +69,7 @@ class Ballot:
 
 
 class RowVote:
-    """Count the votes of the frames of a recording on the rows.
-
-    Parameters
-    ----------
-    rig
-        The rig.
-    settings
-        Settings of the measurement.
-    """
+    """Count the votes of the frames of a recording on the rows."""
 
     def __init__(self, rig: Rig, settings: Settings) -> None:
         self._rig, self._settings = rig, settings

@@ -102,8 +102,6 @@ def number_on_plane(lattice: Lattice, dots: Dots, calibration: ImageCalibration)
     ----------
     lattice, dots
         Rows and columns in the picture, upwards and to the right, and their dots.
-    calibration
-        Mapping between the picture and the imaging plane.
     """
     right, down = calibration.jacobian(dots.image_px.mean(axis=0)).T
     turned = abs(right[0]) + abs(down[1]) < abs(right[1]) + abs(down[0])

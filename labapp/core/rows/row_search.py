@@ -141,12 +141,8 @@ def mask_rows(dots: Dots, frame_shape: tuple[int, int], settings: MaskRowsSettin
 
     Parameters
     ----------
-    dots
-        The dots of one frame.
     frame_shape
         (rows, columns) of that frame, px.
-    settings
-        See `MaskRowsSettings`.
 
     Raises
     ------

@@ -71,8 +71,6 @@ class ReflectedRays(ReadOnlyArrays):
         Unit direction, shape (n, 3).
     plane_mm
         Reflected dot, IPCS (X′, Z′), shape (n, 2), mm.
-    imaging_plane
-        The imaging plane.
     measured
         Number of rays, the first ones, whose dots are those of the match.
     scale

@@ -69,8 +69,6 @@ class Prior:
     cold_match, cold_residual_mm
         Match of the last frame that was measured without a prior, and its root mean square
         residual, mm.
-    basis
-        The splines.
     paths, lit, boundary, level
         Paths of the R rays of the pattern for the last surface; which of them had dots, shape
         (rows, columns); boundary and level of the pool.
@@ -84,8 +82,6 @@ class Prior:
         computed: the sizes of a pool that oscillates recur.
     unseen
         Number of frames since `Tracked.reference_is_seen` was last true.
-    count
-        Number of tracked frames.
     """
 
     tuning: DetectorTuning

@@ -157,8 +157,6 @@ class _Fit:
         Flat indices of the n rays that have a dot, shape (n,).
     near
         Paths of all rays for the initial surface.
-    rounds
-        The rounds of the fit.
     """
 
     prior: Prior

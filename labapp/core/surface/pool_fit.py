@@ -143,10 +143,6 @@ def fit_pool(
     ----------
     match
         The n matched pairs. Without a dark ray in its ``ray_states`` the level is guessed.
-    rig
-        The rig.
-    settings
-        See `FitSettings`.
     initial
         A surface to start from: fewer rounds are needed if it is close. None: z = 0.
     weigh_by_height_sigma

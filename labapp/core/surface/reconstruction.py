@@ -17,15 +17,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class BoundedSurface:
-    """A surface that ends at the pool's boundary: NaN outside it.
-
-    Parameters
-    ----------
-    unbounded
-        The surface, which may continue beyond the boundary.
-    boundary
-        The boundary.
-    """
+    """A surface that ends at the pool's boundary: NaN outside it."""
 
     unbounded: Surface
     boundary: Boundary

@@ -24,6 +24,8 @@ INSIDE = 0.99
 def shape_of(surface: Surface, boundary: Boundary) -> FloatArray:
     """Return convexity (mm), asymmetry and wetting slope (°) of a surface, shape (3,).
 
+    The surface must be defined everywhere within the boundary.
+
     * Convexity: mean height of the longitudinal section through the middle of the boundary, its
       area over its length. Negative for a concave pool.
     * Asymmetry: volume between surface and work piece right of that section (+X) minus that left
@@ -31,13 +33,6 @@ def shape_of(surface: Surface, boundary: Boundary) -> FloatArray:
     * Wetting slope: mean angle along the boundary between the surface and the work piece; positive
       if the surface rises inwards. An interpolated surface has no slope at the boundary itself:
       that at `INSIDE` is used.
-
-    Parameters
-    ----------
-    surface
-        Surface that is defined everywhere within the boundary.
-    boundary
-        The pool's boundary.
     """
     from labapp.core.surface.kernels import shape_kernels
 

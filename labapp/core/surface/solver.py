@@ -33,8 +33,6 @@ class NormalEquations:
 
     Parameters
     ----------
-    basis
-        The splines.
     stiffness
         Weight of the roughness times its matrix, lower band, shape (width + 1, p).
     laser_mm, plane
@@ -303,8 +301,6 @@ def fit_slopes(
 
     Parameters
     ----------
-    basis
-        The splines.
     points_mm
         Points of the slopes, (x, y), shape (n, 2), mm, within the rectangle of the basis.
     slopes

@@ -220,8 +220,6 @@ class SplineSurface(ReadOnlyArrays):
 
     Parameters
     ----------
-    basis
-        The splines.
     coefficients
         Shape (splines,), mm.
     """

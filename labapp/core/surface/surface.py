@@ -62,8 +62,6 @@ def intersect(
 
     Parameters
     ----------
-    surface
-        The surface.
     origin_mm
         Common origin of the rays, above the surface, shape (3,), mm.
     directions

@@ -85,8 +85,6 @@ class CameraFields(QObject):
 
         Parameters
         ----------
-        feed
-            Feed of the camera.
         calibrated
             (rows, columns) of the picture used to calibrate the imaging plane, px; None if unknown.
         """

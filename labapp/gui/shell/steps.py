@@ -420,8 +420,6 @@ def lead(
     ----------
     seen
         The session's overview if already available.
-    measuring
-        Whether frames are being measured.
     """
     facts = _facts(session, seen)
     if session.recording is None:

@@ -83,13 +83,7 @@ def begin_session(study: Study, recording: StudyRecording, progress: Progress) -
 
 
 def must_be_closed(study: Study, recording: StudyRecording, path: Path) -> bool:
-    """Whether an open session is one of the recording's that `begin_session` would change.
-
-    Parameters
-    ----------
-    path
-        Of the open session.
-    """
+    """Whether an open session is one of the recording's that `begin_session` would change."""
     try:
         tasks = _tasks(study, recording)
     except InputError:

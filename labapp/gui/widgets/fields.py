@@ -116,8 +116,6 @@ class NumberField(Field):
 
     Parameters
     ----------
-    label, unit, tooltip
-        Name, unit, and explanation.
     lowest, highest
         The range, including both ends.
     step
@@ -270,8 +268,6 @@ class TextField(Field):
 
     Parameters
     ----------
-    label, tooltip
-        Name and purpose.
     lines
         Number of lines shown; with more than one, Enter begins another and Ctrl+Enter finishes.
     line
@@ -363,8 +359,6 @@ class ChoiceField(Field):
 
     Parameters
     ----------
-    label, tooltip
-        Name and explanation.
     choices
         (key, text) pairs; `value` and ``edited`` give the keys.
     """

@@ -74,8 +74,6 @@ class Feed:
         0 on; the numbers of frames that did not arrive are skipped, and those of the frames missed
         during a change of settings, if the rate is known. `CameraFrame.time_s` is the time since
         the first frame, by the camera's clock, continued when the camera is opened again.
-    on_event
-        Called with every event.
     settings
         Settings applied whenever the camera is opened. Without a trigger it is free-running,
         whatever its previous mode.

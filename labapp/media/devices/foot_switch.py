@@ -155,8 +155,6 @@ class FootSwitch(HidReader):
         The device and its pedals' actions, which may be replaced at any time.
     on_action
         Called with an action when its pedal is pressed, in a thread of the foot switch.
-    on_event
-        Called with every event.
     """
 
     def __init__(

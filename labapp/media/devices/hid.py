@@ -219,8 +219,6 @@ class HidReader:
 
     Parameters
     ----------
-    on_event
-        Called with every event.
     retry_s
         Pause between searches for a missing device, s; None: `RETRY_S`.
     """

@@ -89,8 +89,6 @@ class Recorder:
     ----------
     new_path
         Returns the path of a new recording; it and its notes must not exist.
-    on_event
-        Called with every event.
     writer
         Opens the file of a recording: (path, shape, bit_depth, rate_hz, codec).
     """

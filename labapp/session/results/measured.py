@@ -132,8 +132,6 @@ class StoredResults:
 
         Parameters
         ----------
-        frame, measurement
-            Number of the frame and its measurement.
         correction
             SHA-256 of the correction used; None without.
 
@@ -261,11 +259,6 @@ class StoredResults:
 
     def judge_setup(self, basis: Basis) -> None:
         """Check a set-up by all its current results, and store the verdict.
-
-        Parameters
-        ----------
-        basis
-            Inputs of the results.
 
         Raises
         ------

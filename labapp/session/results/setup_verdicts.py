@@ -13,13 +13,7 @@ from labapp.session.file.database import Database
 
 
 class SetupVerdicts:
-    """Verdicts on the set-ups of a session.
-
-    Parameters
-    ----------
-    database
-        The session file.
-    """
+    """Verdicts on the set-ups of a session."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

@@ -83,8 +83,6 @@ def check(
 
     Parameters
     ----------
-    advice
-        A possible set-up.
     pools, places
         Number of pools, and number of positions of each, with newly drawn noise of the dots and
         errors of the calibration.

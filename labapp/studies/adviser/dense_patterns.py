@@ -31,8 +31,6 @@ class PatternFit:
 
     Parameters
     ----------
-    pattern
-        The pattern.
     least_dots, most_dots
         Dots on the plane for the pools with the fewest and with the most.
     spacing_px

@@ -51,8 +51,6 @@ def join_chains(ridges: Ridges, chosen: IntArray, scale_px: float) -> list[IntAr
 
     Parameters
     ----------
-    ridges
-        Ridges of the frame.
     chosen
         Indices of the chains to use, shape (k,).
     scale_px

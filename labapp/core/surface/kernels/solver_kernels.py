@@ -265,8 +265,6 @@ def height_variances(
 
     Parameters
     ----------
-    grid
-        The splines.
     inverse
         Covariance of the p coefficients (`inverse_band`), shape (p, p), mm².
     of_mean

@@ -132,8 +132,6 @@ def check(
         Called with the parts done, their total, and the current stage; may raise.
     free
         Quantities determined from the pictures alone, see `check_bench`.
-    pool
-        The expected pool.
     """
     text, path = setup_file
     setup = parse_setup(unchecked_setup(text, path), path)

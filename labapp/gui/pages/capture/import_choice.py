@@ -102,8 +102,6 @@ class ImportChoice(Group):
         ----------
         session, preview
             Destination and recording; None if there is none.
-        working
-            Whether a recording is being imported.
         measured
             Whether frames of the session are measured or corrected.
         """
