@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import ndimage, optimize
 
-from labapp.core.values import FloatArray, ReadOnlyArrays
+from labapp.core.values import FloatArray, ReadOnlyArrays, robust_sigma
 
 BLOCKS = 200
 """A series is averaged to at most this many samples (blocks)."""
@@ -192,7 +192,7 @@ def _noise(level: FloatArray, lags: tuple[int, ...]) -> float:
         for lag in lags
         if 4 * lag < len(level)
     ]
-    spread = 1.4826 * max(float(np.median(np.abs(one))) for one in seconds) / np.sqrt(6)
+    spread = max(map(robust_sigma, seconds)) / np.sqrt(6)
     # Lower limit for noise-free series: a thousandth of the range.
     return float(max(spread**2, (1e-3 * float(np.ptp(level))) ** 2, 1e-30))
 

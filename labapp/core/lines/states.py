@@ -288,7 +288,7 @@ def _corner(values: FloatArray, on: BoolArray, near: int) -> int:
         for _ in range(3):
             fit = np.linalg.lstsq(terms * weights[:, None], values[window] * weights, rcond=None)[0]
             off = np.abs(values[window] - terms @ fit)
-            limit = TUKEY * 1.4826 * float(np.median(off)) + 1e-9
+            limit = TUKEY * robust_sigma(off) + 1e-9
             weights = np.sqrt(np.minimum(1.0, limit / np.maximum(off, 1e-12)))
         cost = float(np.sum(np.minimum(off, limit)))
         if cost < least:

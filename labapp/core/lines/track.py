@@ -214,7 +214,7 @@ def oscillation_frequency(time_s: FloatArray, values: FloatArray) -> tuple[float
     # Remove the drift.
     smooth = np.polynomial.Polynomial.fit(time_s, values, 3)(time_s)
     swing = values - smooth
-    limit = 6.0 * 1.4826 * float(np.median(np.abs(swing))) + 1e-9
+    limit = 6.0 * robust_sigma(swing) + 1e-9
     kept = np.abs(swing) < limit
     if not np.var(swing[kept]) > 0:
         return float("nan"), 0.0

@@ -15,7 +15,7 @@ from labapp.core.sequence.mean import (
     setup_sigma_of_mean,
 )
 from labapp.core.surface.measures import SIZES, sigma_name
-from labapp.core.values import FloatArray
+from labapp.core.values import FloatArray, robust_sigma
 from labapp.export.tables import Columns
 from labapp.run.study.plan import Condition
 from labapp.run.study.status import RecordingStatus
@@ -25,9 +25,6 @@ FAR = 5.0
 
 SURE = 0.999
 """A recording outside the interval that contains others with this probability is an outlier."""
-
-MAD = 1.4826
-"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
 
 FEWEST_FRAMES, FEWEST_RECORDINGS = 10, 4
 """Outliers are looked for only among this many or more."""
@@ -239,7 +236,7 @@ def _times(values: FloatArray, own: FloatArray) -> FloatArray:
     The unit is the robust standard deviation of all values, or the value's own σ if larger.
     """
     away = np.abs(values - np.median(values))
-    deviation = np.maximum(MAD * np.median(away), own)
+    deviation = np.maximum(robust_sigma(away), own)
     return np.asarray(
         np.divide(away, deviation, out=np.zeros_like(away), where=deviation > 0), np.float64
     )

@@ -22,7 +22,7 @@ from labapp.core.lines.detection.chains import (
 from labapp.core.lines.detection.gathered import gathered_spots
 from labapp.core.lines.detection.ridges import SCALE_PX, Ridges, find_ridges
 from labapp.core.lines.detection.smooth_path import SmoothPath
-from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays, robust_sigma
 
 END_PX, END_REACH_PX = 10.0, 30.0
 """Length over which the light near a line's end is averaged (median), and length beyond the ridge
@@ -219,7 +219,7 @@ def glow(picture: Grey) -> Grey:
     for _ in range(GLOW_ROUNDS):
         fitted = np.linalg.lstsq(terms * weights[:, None], light * weights, rcond=None)[0]
         off = light - terms @ fitted
-        limit = 3.0 * 1.4826 * float(np.median(np.abs(off))) + 1e-6
+        limit = 3.0 * robust_sigma(off) + 1e-6
         weights = (off < limit).astype(float)
     smooth = (terms @ fitted).reshape(small.shape).astype(np.float32)
     return np.asarray(cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR))

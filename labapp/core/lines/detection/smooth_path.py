@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays, robust_sigma
 
 LEAST_SPEED = 1e-3
 """Least change of the position for a step of 1 px along a path, px."""
@@ -101,5 +101,5 @@ def _local_fit(
 def _robust_weights(points: FloatArray, smooth: FloatArray) -> FloatArray:
     """Tukey's biweights of points from their distance to the smoothed line, shape (n,)."""
     away = np.linalg.norm(points - smooth, axis=-1)
-    limit = 4.685 * 1.4826 * float(np.median(away)) + 1e-6
+    limit = 4.685 * robust_sigma(away) + 1e-6
     return np.asarray(np.maximum(1 - (away / limit) ** 2, 0.0) ** 2 + 1e-6)
