@@ -105,15 +105,10 @@ def regular_size(path: Path) -> int:
 def read_limited(path: Path, largest: int, wanted: str) -> bytes:
     """Read a file of at most ``largest`` bytes; a device or a pipe cannot fill the memory.
 
-    Parameters
-    ----------
-    wanted
-        Expected content, for the errors.
-
     Raises
     ------
     InputError
-        If it cannot be read or is larger.
+        If it cannot be read or is larger; ``wanted`` is what is expected.
     """
     if Path(os.path.realpath(path)).is_fifo():  # not /dev/stdin or /dev/fd/N, which have a writer
         raise InputError(path, "file", "a named pipe", wanted)

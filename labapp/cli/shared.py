@@ -356,21 +356,12 @@ def _results(results: Collection[tuple[int, str]]) -> str:
 def check_target(
     out: Path, *suffixes: str, inputs: Collection[Path] = (), option: str = "--out"
 ) -> None:
-    """Refuse to overwrite a file of another kind, or an input, with results.
-
-    Parameters
-    ----------
-    suffixes
-        Suffixes of files that may be replaced.
-    inputs
-        Files that the command reads.
-    option
-        The option that names ``out``.
+    """Refuse to overwrite a file without one of these suffixes, or an input, with results.
 
     Raises
     ------
     InputError
-        If there is such a file; devices and pipes are written to.
+        If there is such a file; devices and pipes are written to. It names ``option``.
     """
     if not out.is_file():
         return

@@ -29,22 +29,15 @@ PROBLEMS_SHOWN = 10
 
 @contextmanager
 def open_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
-    """Open a table as UTF-8 text; errors of file, encoding and syntax become `InputError`.
+    """Open a table of at most ``largest`` bytes as UTF-8 text; all errors become `InputError`.
 
     Read it with ``csv.reader(…, strict=True)``: otherwise an open quotation mark takes all the rows
     after it for text.
 
-    Parameters
-    ----------
-    wanted
-        Expected content, for the errors.
-    largest
-        Maximum size, bytes.
-
     Raises
     ------
     InputError
-        If the file cannot be read, is too large, or is not text.
+        If the file cannot be read, is too large, or is not text; ``wanted`` is what is expected.
     """
     try:
         size = regular_size(path)

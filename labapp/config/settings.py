@@ -59,17 +59,10 @@ def check_overridden(settings: Settings, source: str) -> None:
 def check_algorithm(settings: Settings, source: str | Path, field: str = "algorithm") -> None:
     """Check that the scheme has the algorithm; the default is allowed for every scheme.
 
-    Parameters
-    ----------
-    settings
-        Settings with known names.
-    source, field
-        Where the algorithm is named.
-
     Raises
     ------
     InputError
-        If the scheme does not have the algorithm, and would ignore it.
+        If the scheme does not have the algorithm, and would ignore it; at this source and field.
     """
     own = SCHEMES[settings.scheme].algorithms
     if settings.algorithm not in (Settings.algorithm, *own):

@@ -80,15 +80,7 @@ class Setup:
         return implausible_values(self.rig)
 
     def require_size(self, shape: tuple[int, ...], name: str) -> None:
-        """Raise `InputError` if frames have another size than the calibration picture.
-
-        Parameters
-        ----------
-        shape
-            (rows, columns) of the frames.
-        name
-            Name of a frame, for the error.
-        """
+        """Raise `InputError` if the calibration picture has another size, (rows, columns)."""
         calibrated = self._frame_px
         height, width = shape
         if calibrated is not None and calibrated != (width, height):

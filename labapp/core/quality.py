@@ -40,13 +40,7 @@ FATAL = frozenset({"blank", "no dots", "dots merge"})
 
 @dataclass(frozen=True)
 class Remark:
-    """Assessment of one property of a frame.
-
-    Parameters
-    ----------
-    words
-        Description and remedy, one or two sentences.
-    """
+    """Assessment of one property of a frame: description and remedy, one or two sentences."""
 
     about: Literal["exposure", "blur", "rows", "reference", "measurement", "height ±"]
     grade: Grade
@@ -55,15 +49,7 @@ class Remark:
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of a frame for measurement.
-
-    Parameters
-    ----------
-    exposure
-        Levels, saturation, contrast, merging.
-    remarks
-        Assessments, the worst first.
-    """
+    """Quality of a frame for measurement, with remarks on it, the worst first."""
 
     exposure: Exposure
     remarks: tuple[Remark, ...]

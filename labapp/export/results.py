@@ -176,13 +176,6 @@ class ResultsWriter:
     def set_setup_status(self, status: str, verdict: SetupVerdict) -> None:
         """Write the check of the set-up by all frames to `run.json` and to every frame's row.
 
-        Parameters
-        ----------
-        status
-            Reliability of the set-up (`Measurement.setup_status`).
-        verdict
-            Check of the set-up by all frames.
-
         Raises
         ------
         InputError

@@ -158,12 +158,7 @@ def columns_of(name: str, sigma_parts: bool = False) -> tuple[Column, ...]:
 def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str, Columns]:
     """Return all tables of a frame, with the columns of `TABLES`.
 
-    Parameters
-    ----------
-    result
-        Result of the frame. `measures` always has a row; the other tables may be empty.
-    calibration
-        Pixel ↔ imaging plane, for the dots' positions on the plane.
+    `measures` always has a row; the other tables may be empty.
     """
     cells = [np.array([cell], object if isinstance(cell, str) else None) for cell in _cells(result)]
     measures = dict(zip(_NAMES["measures"], cells, strict=True))

@@ -90,12 +90,7 @@ def open_window(
 ) -> Iterator[MainWindow]:
     """Show the window; restore signals, error reporting and garbage collection afterwards.
 
-    Parameters
-    ----------
-    file
-        File of the preferences.
-    path
-        Session or recording to open.
+    ``file`` has the preferences; ``path`` is the session or recording to open.
     """
     from labapp.gui.shell.commands import make_window
 

@@ -116,12 +116,9 @@ def preferences_file() -> Path:
 
 
 def read_preferences(path: Path) -> tuple[Preferences, str]:
-    """Read preferences; an unusable file is renamed and the defaults are returned.
+    """Read preferences, and return them with a message for the operator if there was a problem.
 
-    Returns
-    -------
-    preferences, problem
-        ``problem`` is the message for the operator; empty if there was no problem.
+    An unusable file is renamed and the defaults are returned.
     """
     try:
         if path.stat().st_size > LARGEST_BYTES:

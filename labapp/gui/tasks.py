@@ -174,12 +174,9 @@ class Tasks(QObject):
         return task
 
     def cancel_all(self, lasting: bool = True) -> None:
-        """Cancel all tasks and wait until they have stopped; no callback is called afterwards.
+        """Cancel all tasks, or all but the lasting ones, and wait until they have stopped.
 
-        Parameters
-        ----------
-        lasting
-            Whether lasting tasks are cancelled, too.
+        No callback is called afterwards.
         """
         ended = [task for task in self.active if lasting or not task.is_lasting]
         for task in ended:

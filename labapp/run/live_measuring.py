@@ -55,10 +55,7 @@ class LiveMeasuring:
     def measure(self, frame: CameraFrame, with_scene: bool = False) -> LiveResult | None:
         """Measure the next frame; None if it is skipped (`SEARCH_AFTER_S`).
 
-        Parameters
-        ----------
-        with_scene
-            Whether to return its surface for drawing, which takes another millisecond.
+        ``with_scene``: return its surface for drawing, too, which takes another millisecond.
 
         Raises
         ------

@@ -109,14 +109,7 @@ def _with_rows_voted(
     """Yield results in order, with rows decided by a vote among neighbouring frames (`RowVote`).
 
     A frame is judged as soon as `VOTERS` frames with a surface are known, or after
-    `MOST_WAITING` frames.
-
-    Parameters
-    ----------
-    measured
-        Results in order.
-    warm
-        Whether frames are tracked, except where the track was lost.
+    `MOST_WAITING` frames. ``warm``: frames are tracked, except where the track was lost.
     """
     from labapp.core.recording.row_vote import Ballot, RowVote
 

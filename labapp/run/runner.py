@@ -33,16 +33,9 @@ SOME_FRAMES = (
 
 
 def run(frames: Iterable[int], measurer: Measurer, sinks: Sequence[Sink]) -> Generator[FrameResult]:
-    """Measure frames, pass each result to every sink, then yield it.
+    """Measure frames in this order, pass each result to every sink in turn, then yield it.
 
     To stop, close the generator or raise in a sink: frames in progress are cancelled.
-
-    Parameters
-    ----------
-    frames
-        Frame numbers, in the order of measuring.
-    sinks
-        Receivers of the results, in the order of calls.
     """
     with closing(measurer(frames)) as results:
         for result in results:
@@ -64,19 +57,14 @@ def with_setup_check(measurer: Measurer, record: ResidualRecord) -> Measurer:
 
 
 def select_frames(text: str, count: int, option: str = "--frames") -> range:
-    """Return the frames that ``A:B:STEP`` selects, as a Python slice does; ``A`` is one frame.
+    """Return those of ``count`` frames that ``A:B:STEP`` selects, as a Python slice does.
 
-    Parameters
-    ----------
-    text, count
-        The selection, and the number of frames.
-    option
-        Name of the option or input, for the error.
+    ``A`` alone is one frame.
 
     Raises
     ------
     InputError
-        If the text is not of that form, or selects no frame.
+        If the text is not of that form, or selects no frame; it names ``option``.
     """
     require(text, str, option, "frames", f'text such as "0:100:5": {SOME_FRAMES}')
     try:

@@ -53,8 +53,6 @@ def in_parallel(
     ----------
     function
         A module-level function, so that another process can import it.
-    tasks
-        Arguments of the function, one per call.
     what, progress
         Name of the work and the callback for it.
     workers

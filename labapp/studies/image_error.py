@@ -112,13 +112,7 @@ def frame_errors(
     progress: Progress | None = None,
     workers: int | None = None,
 ) -> list[list[FrameErrors]]:
-    """Render frames of known surfaces and measure them by every scheme.
-
-    Returns
-    -------
-    list[list[FrameErrors]]
-        Errors of each frame of each surface.
-    """
+    """Measure rendered frames of known surfaces by every scheme: errors of each frame of each."""
     tasks = [(cap, rig, k, tuple(schemes)) for cap in caps for k in range(frames)]
     found = in_parallel(_frame_errors, tasks, "frames", progress, workers)
     return [found[n * frames : (n + 1) * frames] for n in range(len(caps))]

@@ -80,10 +80,7 @@ def _calibrated(
 ) -> tuple[Calibration, tuple[int, ...]]:
     """Calibrate from pictures, for those of the target with the lens in the setup file.
 
-    Returns
-    -------
-    tuple
-        The calibration, and (rows, columns) of the first picture.
+    Also returns (rows, columns) of the first picture.
     """
     from labapp.config.setup import A_SETUP
     from labapp.config.setup_text import check_lens, lens_of

@@ -233,10 +233,7 @@ def _adjusted(
 ) -> tuple[Adjustment, list[Sighting], list[IntArray]]:
     """Adjust and label again in turn until no label changes.
 
-    Returns
-    -------
-    adjustment, sightings, labels
-        The adjusted set-up; the dots of each picture that were used; and their labels.
+    Returns the adjusted set-up, the dots of each picture that were used, and their labels.
     """
     labels = _labelled(pictures, rig, calibration, freed)
     made: Adjustment | None = None

@@ -31,14 +31,12 @@ MOST_SIGNAL_STEPS = 8
 
 @dataclass(frozen=True)
 class DynamicsSettings:
-    """Settings of the analysis.
+    """Settings of the analysis; see `fit_oscillations` and `spectrogram`.
 
     Parameters
     ----------
     of
         Name of the series whose spectra and spectral peak are computed.
-    band_hz, segment_s
-        See `fit_oscillations` and `spectrogram`.
     """
 
     of: str = "height_mm"

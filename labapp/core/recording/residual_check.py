@@ -125,8 +125,6 @@ class SetupVerdict:
 
     Parameters
     ----------
-    is_doubtful
-        Whether the recording contradicts the set-up.
     reason
         Why, or why no verdict is possible, in a clause.
     suspects

@@ -40,8 +40,6 @@ def paper_picture(
 
     Parameters
     ----------
-    direction
-        Viewing direction or camera.
     paper
         Width of the cropped picture, and resolution.
     high_over_wide

@@ -116,10 +116,7 @@ def pace_text(
 ) -> str:
     """Text of the rate of measurement, and the reason if there is no figure.
 
-    Parameters
-    ----------
-    skipped
-        Number of frames that were not measured because a newer one was waiting.
+    ``skipped`` frames were not measured because a newer one was waiting.
     """
     if result is None:
         return FIRST if came_hz != 0 else NO_FRAMES

@@ -11,13 +11,7 @@ from labapp.gui.widgets.exposure import ExposureBars
 
 
 class LivePicture:
-    """Shows frames of a camera in the page's picture.
-
-    Parameters
-    ----------
-    picture, exposure
-        Widgets of the page, which are used without a camera, too.
-    """
+    """Shows frames of a camera in the page's picture, which is used without a camera, too."""
 
     def __init__(self, picture: PictureView, exposure: ExposureBars) -> None:
         self._picture, self._exposure = picture, exposure
@@ -43,10 +37,7 @@ class LivePicture:
     def follow(self, live: Live, is_measured: bool) -> bool:
         """Show the newest frame and assessment; returns whether a frame was shown.
 
-        Parameters
-        ----------
-        is_measured
-            Whether frames are measured, which assesses them better; see `show_quality`.
+        Frames that are measured are assessed better by that: see `show_quality`.
         """
         shown = live.newest()
         is_shown = shown is not None and self._picture.isVisible()

@@ -48,10 +48,7 @@ class LiveSurface(QWidget):
     def follow(self, result: LiveResult | None, watch: LiveWatch) -> bool:
         """Show the newest drawn surface and request the next; returns whether there was one.
 
-        Parameters
-        ----------
-        result
-            Newest result since the last call; None if there is none.
+        ``result`` is the newest since the last call; None if there is none.
         """
         scene = watch.scene()
         watch.ask_for_scene()

@@ -64,16 +64,9 @@ def frame_statuses(seen: Overview) -> IntArray:
 def next_frame(
     frames: IntArray, wanted: BoolArray, current: int, forward: bool = True
 ) -> int | None:
-    """The nearest wanted frame after or before the current one; None if there is none.
+    """Nearest wanted frame after or before the current one; None if there is none.
 
-    Parameters
-    ----------
-    frames
-        Numbers of the frames, ascending, shape (n,).
-    wanted
-        Whether each frame is wanted, shape (n,), bool.
-    current
-        Number of the current frame.
+    ``frames`` ascend; they and ``wanted`` have shape (n,).
     """
     chosen = frames[wanted]
     chosen = chosen[chosen > current] if forward else chosen[chosen < current][::-1]

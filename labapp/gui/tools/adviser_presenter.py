@@ -89,10 +89,7 @@ def why_not_advised(session: Session | None) -> str:
 def why_not_applied(session: Session | None, advice: Advice, sought_for: Path | None) -> str:
     """Reason why an advice does not concern the open session; empty if it does.
 
-    Parameters
-    ----------
-    sought_for
-        File of the session for which it was sought; None: without a session.
+    ``sought_for`` is the file of the session for which it was sought; None: without a session.
     """
     if sought_for != (None if session is None else session.path):
         of = "without a session" if sought_for is None else f"for {sought_for.stem}"

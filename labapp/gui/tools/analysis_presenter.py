@@ -69,10 +69,7 @@ def setup_of(session: Session | None) -> SetupOf | None:
 def of_former_setup(session: Session | None, of: SetupOf | None) -> str:
     """Text about a budget for another set-up than the session's; empty if it is for this one.
 
-    Parameters
-    ----------
-    of
-        Set-up for which the budget is; None if it is not that of a session.
+    ``of`` is the set-up for which the budget is; None if it is not that of a session.
     """
     if of is None or of == setup_of(session):
         return ""

@@ -136,10 +136,7 @@ class SimulatorWindow(ToolWindow):
     def _draw(self, seed: int | None) -> None:
         """Draw the first frame in the background; only the last request is shown.
 
-        Parameters
-        ----------
-        seed
-            None: the scenario's, which is then shown with its number of frames.
+        Without a seed it is the scenario's, which is then shown with its number of frames.
         """
         self._seed = seed
         path = self.scenario.value()

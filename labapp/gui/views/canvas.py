@@ -26,15 +26,7 @@ ZOOM = 1.25
 
 
 class Drawn(FollowsTheme, QWidget):
-    """A drawing; without keys of its own it cannot get the focus.
-
-    Parameters
-    ----------
-    name
-        Name of the drawing for a screen reader.
-    keys
-        Description of the keys for a screen reader.
-    """
+    """A drawing, with its name and its keys for a screen reader; without keys it gets no focus."""
 
     ROLE = QAccessible.Role.Graphic
 

@@ -43,13 +43,7 @@ td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowra
 
 
 def summary_page(summary: StudySummary, made: str) -> str:
-    """Return the page as self-contained HTML with inline SVG.
-
-    Parameters
-    ----------
-    made
-        Date and time for the footer.
-    """
+    """Return the page as self-contained HTML with inline SVG, ``made`` at this date and time."""
     parts = [f"<h1>{escape(summary.title)}</h1>", _head(summary)]
     parts += _problems(summary)
     if summary.groups:

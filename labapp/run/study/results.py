@@ -62,12 +62,9 @@ def write_results(
     parts: Sequence[tuple[RecordingStatus, Tasks | None]],
     surfaces: bool,
 ) -> StudySummary:
-    """Write the results of a study into its folder; see `Study.results`.
+    """Write the results of a study, status and tasks of each recording, into its folder.
 
-    Parameters
-    ----------
-    parts
-        Status and tasks of each recording.
+    See `Study.results`.
     """
     recordings: list[RecordingSummary] = []
     outliers: list[Outlier] = []

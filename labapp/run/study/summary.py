@@ -110,10 +110,7 @@ class StudySummary:
 def recording_means(table: Columns) -> dict[str, Mean]:
     """Return the mean of each size over the frames with a surface; empty if there is none.
 
-    Parameters
-    ----------
-    table
-        The columns of `measures.csv`.
+    The table has the columns of `measures.csv`.
     """
     measured = table["status"] == "ok"
     if not measured.any():

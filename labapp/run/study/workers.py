@@ -196,12 +196,9 @@ def local_workers(count: int | None, tasks: int) -> Iterator[Workers]:
 
 @contextmanager
 def dask_workers(address: str) -> Iterator[Workers]:
-    """Connect to a Dask scheduler. Needs dask[distributed], which the extra ``study`` installs.
+    """Connect to a Dask scheduler at ``tcp://HOST:PORT``.
 
-    Parameters
-    ----------
-    address
-        Address of the scheduler: ``tcp://HOST:PORT``.
+    Needs dask[distributed], which the extra ``study`` installs.
 
     Raises
     ------

@@ -122,11 +122,6 @@ class LaserPlace:
 
     Rays are traced to points on the extreme pools instead of along the pattern's rays: a slightly
     shifted pool has a ray right at its edge.
-
-    Parameters
-    ----------
-    angle_deg, distance_mm
-        Position of the laser.
     """
 
     def __init__(

@@ -115,14 +115,7 @@ def read_request(path: Path) -> dict[str, Any]:
 def parse_request(
     values: Mapping[str, Any], source: str | Path
 ) -> tuple[ExpectedPools, BenchLimits]:
-    """Expected pools and limits of the bench from the tables of a request.
-
-    Parameters
-    ----------
-    values
-        Table → key → value.
-    source
-        Origin of the values, for messages.
+    """Expected pools and limits of the bench from the tables of a request, table → key → value.
 
     Raises
     ------

@@ -283,12 +283,7 @@ def grid_of(
 ) -> tuple[Candidate, ...]:
     """Set-ups evenly over the limits, one laser position after the other.
 
-    Parameters
-    ----------
-    counts
-        Numbers of angles, distances and plane distances.
-    progress, workers
-        See `in_parallel`.
+    ``counts``: of angles, distances and plane distances; the rest as in `in_parallel`.
     """
     ranges = (limits.angle_deg, limits.distance_mm, limits.plane_mm)
     angles, distances, planes = (

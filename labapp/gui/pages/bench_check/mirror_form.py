@@ -11,15 +11,7 @@ from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 
 
 class MirrorForm(FieldForm):
-    """Fields of the mirror in the selected picture.
-
-    Parameters
-    ----------
-    selected
-        Returns that picture.
-    change
-        Called with the picture when its mirror was changed.
-    """
+    """Fields of the mirror in the selected picture, which ``change`` gets when it is changed."""
 
     def __init__(
         self, selected: Callable[[], ListedPicture], change: Callable[[ListedPicture], object]

@@ -98,12 +98,7 @@ class ImportChoice(Group):
     ) -> None:
         """Show what would be imported, or the reason why it cannot be.
 
-        Parameters
-        ----------
-        session, preview
-            Destination and recording; None if there is none.
-        measured
-            Whether frames of the session are measured or corrected.
+        ``measured``: frames of the session are measured or corrected.
         """
         choice = None if preview is None else self.choice()
         why_not = refusal(session, choice, working)

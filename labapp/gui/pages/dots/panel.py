@@ -115,10 +115,7 @@ class DotsPanel(QWidget):
     def show_unmet_needs(self, unmet_need: Mapping[str, str]) -> bool:
         """Disable the buttons of edits with unmet needs, given by the buttons' texts.
 
-        Returns
-        -------
-        bool
-            Whether the button with the focus is among them.
+        Returns whether the button with the focus is among them.
         """
         focused = False
         for words, button in self.buttons.items():

@@ -25,14 +25,7 @@ def estimated_bytes(
 ) -> float:
     """Approximate number of bytes that will be written.
 
-    Parameters
-    ----------
-    frames, surfaces
-        Numbers of written frames, and of those with a surface.
-    area_mm2
-        Mean area of the surfaces.
-    frame_px
-        Number of pixels of a frame.
+    The frames have ``frame_px`` pixels each, and the surfaces this area on average.
     """
     nodes = area_mm2 / request.spacing_mm**2
     triangles = 2 * nodes + EDGE_TRIANGLES

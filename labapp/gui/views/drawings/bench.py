@@ -59,12 +59,8 @@ CLICK_PX = 22
 class BenchView(Sketch):
     """Views of the bench along −X (Y to the right, Z up) and from above (X downwards), mm.
 
-    The fates of the rays differ in line style (solid, dashed, dotted) as well as in colour.
-
-    Parameters
-    ----------
-    fields
-        Fields of the dimensions, by the keys of `DRAWN`.
+    The fates of the rays differ in line style (solid, dashed, dotted) as well as in colour. The
+    fields of the dimensions have the keys of `DRAWN`.
     """
 
     def __init__(self, fields: Mapping[str, NumberField]) -> None:

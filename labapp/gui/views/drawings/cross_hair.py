@@ -23,13 +23,7 @@ LOW_PX = 420
 
 
 class CrossHairView(Sketch):
-    """Diode, beam, fan edges, and the cross on the work piece with fields for l₁, l₂, l₃; mm.
-
-    Parameters
-    ----------
-    names, fields
-        Names and fields of l₁, l₂, l₃.
-    """
+    """Diode, beam, fan edges, and the cross on the work piece with fields for l₁, l₂, l₃; mm."""
 
     def __init__(self, names: Sequence[str], fields: Sequence[NumberField]) -> None:
         self.plot = make_plot("Y, mm", "Z, mm")
