@@ -36,7 +36,7 @@ def check_owned(folder: Path, command: str, names: Collection[str] = ()) -> None
         If one of the names is a file that the command did not write, an earlier file has changed
         since, or either is a link.
     """
-    _check(folder, command, {*_recorded(folder, command), *names})
+    check_added(folder, command, {*_recorded(folder, command), *names})
 
 
 def check_added(folder: Path, command: str, names: Collection[str]) -> None:
@@ -47,11 +47,6 @@ def check_added(folder: Path, command: str, names: Collection[str]) -> None:
     InputError
         As `check_owned`, for these names.
     """
-    _check(folder, command, names)
-
-
-def _check(folder: Path, command: str, names: Collection[str]) -> None:
-    """Check that a command may write these files."""
     recorded = _recorded(folder, command)
     expected = "another folder, or this file moved out of it"
     for name in sorted({f"{command}.json", *names}):

@@ -247,15 +247,15 @@ def test_pictures_are_listed_edited_and_removed(
     assert page.check_button.isEnabled()
     assert not page.use_button.isEnabled()
     page.list.selectRow(1)
-    page.kind.edited.emit("cap")
-    page.height_field.edited.emit(0.5)
-    page.diameter.edited.emit(8.0)
+    page.mirror_form.kind.edited.emit("cap")
+    page.mirror_form.height_field.edited.emit(0.5)
+    page.mirror_form.diameter.edited.emit(8.0)
     assert [one.mirror for one in page.chosen] == [Plate(0.0), Cap(8.0, 0.5)]
-    page.height_field.edited.emit(0.0)
+    page.mirror_form.height_field.edited.emit(0.0)
     assert not page.check_button.isEnabled()
     page.remove_button.click()
     assert [one.mirror for one in page.chosen] == [Plate(0.0)]
-    assert not page.diameter.editor.isEnabled()
+    assert not page.mirror_form.diameter.editor.isEnabled()
 
 
 def test_entered_uncertainties_can_be_cleared(
@@ -318,7 +318,7 @@ def test_work_pressed_twice_runs_once(
         free.clear()
     page.check_button.click()
     former = page.workspace.tasks.active[0]
-    page.kind.edited.emit("cap")
+    page.mirror_form.kind.edited.emit("cap")
     page.check_button.click()  # with another mirror
     assert former.control.cancelled.is_set()
     assert len(page.workspace.tasks.active) == 2

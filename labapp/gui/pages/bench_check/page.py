@@ -283,8 +283,6 @@ class BenchCheckPage(Page):
         self.list.verticalHeader().setDefaultSectionSize(ROW_PX)
         self.list.setFixedHeight(ROW_PX * (LIST_ROWS + 1) + 8)
         self.mirror_form = MirrorForm(self._selected, self.change)
-        self.kind, self.diameter = self.mirror_form.kind, self.mirror_form.diameter
-        self.height_field = self.mirror_form.height_field
         tip = "Find the dots' rays and adjust the set-up to the known mirrors"
         self.check_button = button("Check", tip, self.check)
         tip = "Measure with the adjusted set-up; undo restores the former one"
