@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from labapp.core.images.band_pass import DetectorTuning, band_pass_dots, quick_dots
+from labapp.core.images.band_pass import PEAK_GAIN, DetectorTuning, band_pass_dots, quick_dots
 from labapp.core.images.dots import BandPassSettings
 from labapp.core.values import CannotMeasure, FloatArray
 from tests.scenes import gaussian_dots
@@ -125,8 +126,22 @@ def test_threads_can_share_a_tuning() -> None:
         np.testing.assert_array_equal(result, alone[k % 6])
 
 
+@pytest.mark.parametrize("size_px", [1.2, SIZE_PX])  # searched at full and at half resolution
+def test_only_peaks_over_the_threshold_are_dots(size_px: float) -> None:
+    rng = np.random.default_rng(12)
+    image, settings = frame(places(rng), rng), BandPassSettings(size_px=size_px)
+    tuning = DetectorTuning.of(image, settings)
+    brightest = PEAK_GAIN * float(quick_dots(image, tuning, settings).peak.max())
+    below = replace(tuning, least=0.95 * brightest)
+    assert (PEAK_GAIN * quick_dots(image, below, settings).peak > 0.95 * brightest).all()
+    noisy = replace(tuning, over_noise=1.05 * brightest / float(tuning.noise.min()))
+    for above in (replace(tuning, least=1.05 * brightest), noisy):
+        with pytest.raises(CannotMeasure, match="no-dots"):
+            quick_dots(image, above, settings)
+
+
 @pytest.mark.parametrize("shape", [(16, 16), (24, 600)])
 def test_blank_picture_smaller_than_a_dot_raises_no_dots(shape: tuple[int, int]) -> None:
-    tuning = DetectorTuning(4.0, np.ones(shape, np.float32), np.ones(shape, np.float32))
+    tuning = DetectorTuning(4.0, np.ones(shape, np.float32), 1.0, 1.0)
     with pytest.raises(CannotMeasure, match="no-dots"):
         quick_dots(np.full(shape, 7, np.uint8), tuning, BandPassSettings())

@@ -111,13 +111,14 @@ class DetectorTuning(ReadOnlyArrays):
         Standard deviation of a dot's light, px.
     noise
         Local standard deviation of the camera's noise, grey levels, shape (height, width).
-    floor
-        Threshold for peaks of the band-passed frame, shape (height, width).
+    over_noise, least
+        Threshold for peaks of the band, as a multiple of the noise; its minimum, grey levels.
     """
 
     size_px: float
     noise: Grey
-    floor: Grey
+    over_noise: float
+    least: float
 
     @classmethod
     def of(cls, frame: Image, settings: BandPassSettings) -> DetectorTuning:
@@ -130,10 +131,14 @@ class DetectorTuning(ReadOnlyArrays):
         """
         return _tuned(as_picture(frame), settings)[0]
 
+    def floor(self, noise: Grey) -> Grey:
+        """Threshold for peaks where the noise has given values, of any shape."""
+        return np.asarray(np.maximum(np.float32(self.over_noise) * noise, np.float32(self.least)))
+
     @cached_property
     def coarse(self) -> Grey:
         """Threshold for pixels of the half-resolution band that may contain a peak."""
-        return np.asarray(np.float32(NEARLY) * self.floor[::2, ::2])
+        return np.float32(NEARLY) * self.floor(self.noise[::2, ::2])
 
 
 def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
@@ -280,13 +285,11 @@ def _tuned(picture: Picture, settings: BandPassSettings) -> tuple[DetectorTuning
     noise = local_noise(picture)
     size = settings.size_px or estimate_size(picture, noise)
     seen = _BandPassed(without_spikes(picture, noise, size), size)
-    white = float(np.median(noise[::8, ::8])) * noise_gain(size)
-    every = 4 // seen.step
+    every, white = 4 // seen.step, float(np.median(noise[::8, ::8])) * noise_gain(size)
     grain = band_noise(seen.band[::every, ::every], white) / max(white, 1e-9)
     least = LEAST_NOISE * max(map(abs, cv2.minMaxLoc(seen.band)[:2])) + 1e-6
-    floor = noise * np.float32(settings.threshold * grain * noise_gain(size))
-    np.maximum(floor, np.float32(settings.threshold * least), out=floor)
-    return DetectorTuning(size, noise, floor), seen
+    over_noise = settings.threshold * grain * noise_gain(size)
+    return DetectorTuning(size, noise, over_noise, settings.threshold * least), seen
 
 
 class _BandPassed:
@@ -339,12 +342,13 @@ class _BandPassed:
         """Return the peaks above the threshold."""
         from labapp.core.images import band_pass_kernels
 
-        band, floor, disc = self.band, tuning.floor, peak_disc(self.size)
-        if self.step == 2:
-            (u, v), bright = band_pass_kernels.upsampled_peaks(band, tuning.coarse, floor, disc)
-            return u, v, bright
-        u, v = band_pass_kernels.peaks(band, floor, disc)
-        return u, v, band[v, u].astype(float)
+        band, disc = self.band, peak_disc(self.size)
+        if self.step == 1:
+            u, v = band_pass_kernels.peaks(band, tuning.floor(tuning.noise), disc)
+            return u, v, band[v, u].astype(float)
+        (u, v), bright = band_pass_kernels.upsampled_peaks(band, tuning.coarse, disc)
+        over = bright > tuning.floor(tuning.noise[v, u])
+        return u[over], v[over], bright[over]
 
     def _dot_like(self, u: IntArray, v: IntArray, bright: FloatArray) -> BoolArray:
         """Whether peaks are round and do not respond more strongly to a much finer band."""
@@ -431,10 +435,11 @@ def _shifted_gaussians(sigma: float, widest: float) -> Grey:
     They are padded to the length of the widest kernel and by a pixel on either side.
     """
     weights, side = kernel(sigma), len(kernel(widest))
-    line = np.pad(weights, (side - len(weights)) // 2)
-    shifted = np.stack([np.pad(line, (k, 2 - k)) for k in range(3)])
+    shifted, before = np.zeros((3, side + 2), np.float32), (side - len(weights)) // 2
+    for k in range(3):
+        shifted[k, before + k : before + k + len(weights)] = weights
     shifted.flags.writeable = False
-    return np.asarray(shifted)
+    return shifted
 
 
 def window_widths(next_px: FloatArray, reach: float) -> FloatArray:

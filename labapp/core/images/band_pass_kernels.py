@@ -233,10 +233,8 @@ def _is_upsampled_peak(
     return True
 
 
-@_compiled(_grey, _grey, _grey, _mask)
-def upsampled_peaks(
-    band: Grey, low: Grey, floor: Grey, disc: BoolArray
-) -> tuple[IntArray, FloatArray]:
+@_compiled(_grey, _grey, _mask)
+def upsampled_peaks(band: Grey, low: Grey, disc: BoolArray) -> tuple[IntArray, FloatArray]:
     """Find peaks of a band that is upsampled twofold where it exceeds ``low`` (`peaks`).
 
     Parameters
@@ -244,8 +242,6 @@ def upsampled_peaks(
     band, low
         Shape (height, width); pixels that do not exceed ``low`` contain no peak and do not
         compete with one.
-    floor
-        Threshold for peaks, shape (2·height, 2·width).
     disc
         See `peaks`.
 
@@ -269,9 +265,8 @@ def upsampled_peaks(
             v, u = 2 * over[k, 0] + m // 2, 2 * over[k, 1] + m % 2
             if fours[k, m] < most or not _is_upsampled_peak(fours, number, disc, v, u):
                 continue
-            if most > floor[v, u]:
-                found[0, count], found[1, count], high[count] = u, v, most
-                count += 1
+            found[0, count], found[1, count], high[count] = u, v, most
+            count += 1
     row = np.argsort(found[1, :count], kind="mergesort")
     return found[:, :count][:, row], high[:count][row]
 

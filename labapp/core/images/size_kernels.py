@@ -10,6 +10,7 @@ from numba import types
 
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import compiled_for as _compiled_for
+from labapp.core.compiled import inner as _inner
 from labapp.core.images.dots import Grey, Picture
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
@@ -18,6 +19,36 @@ _f1, _f2 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2))
 _grey = types.Array(types.float32, 2, "C", readonly=True)
 _byte = types.Array(types.uint8, 2, "C", readonly=True)
 _ints = types.Array(_i, 1, "A", readonly=True)
+
+
+BINS = 256
+"""Bins in which values are counted to find their median."""
+
+
+@_inner
+def _median(values: Grey) -> float:
+    """Median of values ≥ 0, shape (n,): the bin that contains it is found first, then sorted.
+
+    `np.median` partitions all values, which takes several times as long.
+    """
+    most = values.max()
+    if not 0.0 < most < np.inf:  # NaN, too
+        return float(np.median(values))
+    counts, place, per_value = np.zeros(BINS, np.int64), np.empty(len(values), np.int64), 1 / most
+    for k in range(len(values)):
+        place[k] = min(int((BINS - 1) * (values[k] * per_value)), BINS - 1)
+        counts[place[k]] += 1
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    first, before = 0, 0
+    while before + counts[first] <= low:
+        before += counts[first]
+        first += 1
+    last, until = first, before + counts[first]
+    while until <= high:
+        last += 1
+        until += counts[last]
+    near = np.sort(values[(place >= first) & (place <= last)])
+    return float((near[low - before] + near[high - before]) / 2)
 
 
 @_compiled_for(*((own, _i, _i) for own in (_grey, _byte)))
@@ -42,7 +73,7 @@ def tile_noise(image: Picture, rows: int, columns: int) -> Grey:
                     ends += float(image[v - 1, u + 1]) + float(image[v + 1, u - 1])
                     some[count] = abs(4.0 * float(image[v, u]) - 2.0 * sides + ends) / 6.0
                     count += 1
-            result[i, j] = np.median(some)
+            result[i, j] = _median(some)
     return result
 
 
