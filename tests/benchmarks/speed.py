@@ -2,7 +2,8 @@
 
 Run as ``python -m tests.benchmarks.speed [--frames N] [--cache FOLDER] [--cases FOLDER …]``. The
 video is that of `labapp benchmark`. A folder of cases has a folder each with ``frame.png`` and
-``setup.toml``; each frame is measured independently, after one that is not counted. Times are
+``setup.toml``; each frame is measured independently, after all have been measured once, which loads
+the compiled functions that only some frames need. Times are
 processor times on one core, unless stated otherwise. Each ratio is from one run: where other
 programs share the cores, ratios are more reliable than times. The profile contains the time of a
 followed frame by module, including the profiler's overhead, and calls of the costliest functions.
@@ -82,7 +83,8 @@ def time_cases(folder: Path) -> None:
     for case in sorted(path.parent for path in folder.glob("*/frame.png")):
         with open_source(case / "frame.png") as source:
             cases.append((source.frame(0).image, read_setup(case / "setup.toml").bench))
-    measure(*cases[0], Settings())
+    for case in cases:
+        measure(*case, Settings())
     times_ms = 1e3 * np.array([seconds(measure, *case, Settings()) for case in cases])
     print(f"cold frames of {folder.name}: {len(cases)}")
     print_ratio("  median, ms", float(np.median(times_ms)), "<= 100")

@@ -270,7 +270,6 @@ def test_reflection_far_outside_the_boundary_is_unlikely() -> None:
 
 def test_only_the_newest_fits_of_a_frame_are_cached(monkeypatch: pytest.MonkeyPatch) -> None:
     observed, labels = scene()
-    monkeypatch.setattr(observation, "COUNTED_EVERY", 1)
 
     def fitted(row: int) -> FittedPool:
         some = labels.copy()

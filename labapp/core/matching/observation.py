@@ -41,10 +41,9 @@ RESOLVED_SIZES = 2.2
 """Dots nearer to each other than this multiple of their standard deviation are not resolved: two
 equal Gaussians have a single peak up to 2, and pixels and noise blur them further."""
 
-KEPT_BYTES, COUNTED_EVERY = 100_000_000, 32
-"""Approximate limit for the factors of the cached fits of a frame, bytes, beside which the rest of
-a fit is small. That is over a thousand fits of a usual pool. The size is checked once in so many
-fits, and whenever as many fits of the size of the new one would exceed it."""
+KEPT_BYTES = 100_000_000
+"""Limit for the factors of the cached fits of a frame, bytes, beside which the rest of a fit is
+small. That is over a thousand fits of a usual pool."""
 
 EDGE_MM, EDGE_PX = 0.5, 4.0
 """A dot nearer to the edge of the plane or of the frame may be cut off and does not count as in
@@ -171,10 +170,8 @@ class Observation(ReadOnlyArrays):
             near = None if initial is None else initial.surface
             try:
                 pool = fit_pool(matched, self.rig, settings, near)
-                alike = pool.factor.nbytes * len(self._fitted)
-                if alike > KEPT_BYTES or len(self._fitted) % COUNTED_EVERY == 0:
-                    self._forget_oldest()
-                self._fitted[key] = pool
+                self._forget_oldest()
+                self._fitted[key], self._sizes[key] = pool, pool.factor.nbytes
             except CannotMeasure as failure:  # its traceback would keep the arrays of the fit alive
                 self._fitted[key] = (failure.status, failure.reason)
         found = self._fitted[key]
@@ -198,16 +195,19 @@ class Observation(ReadOnlyArrays):
 
     def _forget_oldest(self) -> None:
         """Drop the oldest fits from the cache while all factors exceed `KEPT_BYTES`."""
-        sizes = {k: p.factor.nbytes for k, p in self._fitted.items() if isinstance(p, FittedPool)}
-        over = sum(sizes.values()) - KEPT_BYTES
-        for key, size in sizes.items():
-            if over <= 0:
-                break
-            del self._fitted[key]
-            over -= size
+        over = sum(self._sizes.values()) - KEPT_BYTES
+        while over > 0:
+            oldest = next(iter(self._sizes))
+            over -= self._sizes.pop(oldest)
+            del self._fitted[oldest]
 
     @cached_property
     def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | tuple[str, str]]:
+        return {}
+
+    @cached_property
+    def _sizes(self) -> dict[tuple[bytes, bytes, FitSettings], int]:
+        """Size of the factor of each cached fit, bytes, the oldest first."""
         return {}
 
     @cached_property

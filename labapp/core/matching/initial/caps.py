@@ -15,7 +15,6 @@ import numpy as np
 from labapp.core.matching.hypothesis import rough_costs
 from labapp.core.matching.label_growth import matched_labels
 from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try_fit
-from labapp.core.surface.pool_fit import FittedPool
 from labapp.core.values import FloatArray, IntArray
 
 _ASPECTS = (0.9, 1.1, 1.35)
@@ -92,17 +91,14 @@ def search_caps(observed: Observation) -> Iterator[IntArray]:
             best[count], count = found[k], count + 1
             if count == MOST_CAPS:
                 break
-    shape = observed.rays.absent.shape
-    likely = [
-        (pool.residual_rms_mm / np.sqrt(len(pool.residual_mm)), k, pool)
-        for k in range(count)
-        if (pool := try_fit(observed, best[k].reshape(shape), QUICK))
-    ]
-    likely.sort(key=lambda one: one[0])
+    labelled = best[:count].reshape(count, *observed.rays.absent.shape)
+    misfit_mm = observed.quick_misfits(list(labelled))
+    misfit_mm /= np.sqrt(np.count_nonzero(labelled != UNLABELLED, axis=(1, 2)))
+    likely = labelled[np.argsort(misfit_mm, kind="stable")]
     matched: list[tuple[float, IntArray]] = []
     known: set[bytes] = set()
     for part, most in ((likely[:FIRST_CAPS], FIRST_YIELDED), (likely[FIRST_CAPS:], MOST_YIELDED)):
-        each = (_matched(observed, best[k].reshape(shape), pool) for _, k, pool in part)
+        each = (_matched(observed, labels) for labels in part)
         matched = sorted([*matched, *filter(None, each)], key=lambda one: one[0])
         ranked = {labels.tobytes(): labels for _, labels in matched}
         for key, labels in list(ranked.items())[:most]:
@@ -111,10 +107,11 @@ def search_caps(observed: Observation) -> Iterator[IntArray]:
                 yield labels
 
 
-def _matched(
-    observed: Observation, labels: IntArray, pool: FittedPool
-) -> tuple[float, IntArray] | None:
+def _matched(observed: Observation, labels: IntArray) -> tuple[float, IntArray] | None:
     """Cost and labels after one prediction from the fit to those of a cap, and a second fit."""
+    pool = try_fit(observed, labels, QUICK)
+    if pool is None:
+        return None
     labels = matched_labels(observed, pool, labels)
     fitted = try_fit(observed, labels, QUICK, pool)
     return None if fitted is None else (rough_costs(observed, labels, fitted)[1], labels)

@@ -100,22 +100,26 @@ def _accumulate(
 
 
 @_inner
-def _add_rays(
-    sums: tuple[FloatArray, FloatArray, FloatArray],
+def _sums_of(
     rays: IntArray,
     over: FloatArray,
     sharp: FloatArray,
     dark: BoolArray,
     missing: float,
     levels: tuple[float, float, int],
-) -> None:
-    """Add the terms of some rays to the sums of `level_negative_log_likelihood` for every drop."""
-    (nats, factors, lines), (first, step, _) = sums, levels
+) -> FloatArray:
+    """Sum of the terms of some rays at each level, see `level_negative_log_likelihood`: (d, count).
+
+    A product of factors is kept instead of a sum of logarithms, see `_accumulate`.
+    """
+    drops, (first, step, count) = len(over), levels
+    nats, factors = np.zeros((drops, count)), np.ones((drops, 2, count))
+    lines = np.zeros((drops, 2, count + 1))
     for m in range(len(rays)):
         n = rays[m]
         slope = sharp[n] * step
         grows = np.exp(abs(slope))
-        for d in range(len(over)):
+        for d in range(drops):
             start = sharp[n] * (over[d, n] + first)
             _accumulate(factors[d, 0], lines[d], start, slope, grows, 1.0)
             if dark[n] and missing > 0.0:
@@ -124,17 +128,13 @@ def _add_rays(
         if m % RAYS_PER_LOG == RAYS_PER_LOG - 1:
             nats += np.log(factors[:, 0] / factors[:, 1])
             factors[:] = 1.0
-
-
-@_inner
-def _total(nats: FloatArray, factors: FloatArray, lines: FloatArray) -> FloatArray:
-    """Nats of each level from the sums of `_add_rays` for one drop."""
-    total, start, slope = np.empty(len(nats)), 0.0, 0.0
-    for k in range(len(nats)):
-        start, slope = start + lines[0, k], slope + lines[1, k]
-        added = np.log(factors[0, k] / factors[1, k]) + start + k * slope
-        total[k] = max(nats[k] + added, 0.0)  # rounded
-    return total
+    for d in range(drops):
+        start, slope = 0.0, 0.0
+        for k in range(count):
+            start, slope = start + lines[d, 0, k], slope + lines[d, 1, k]
+            added = np.log(factors[d, 0, k] / factors[d, 1, k]) + start + k * slope
+            nats[d, k] = max(nats[d, k] + added, 0.0)  # rounded
+    return nats
 
 
 @_compiled(FLOATS_2, FLOATS_1, BOOLS_1, FLOATS_1, FLOAT, _levels, FLOATS_2)
@@ -176,9 +176,9 @@ def level_negative_log_likelihood(
     Returns
     -------
     FloatArray
-        Nats, shape (d, b, count); infinite for blurs that are negligible at all levels.
+        Nats, shape (d, b, count); may be infinite where negligible.
     """
-    drops, count = len(over), levels[2]
+    drops, (first, step, count) = len(over), levels
     made = np.full((drops, blurs.shape[1], count), np.inf)
     is_same = np.ones(len(signed_sharpness), np.bool_)
     for d in range(1, drops):
@@ -188,18 +188,16 @@ def level_negative_log_likelihood(
     least = np.inf
     for b in range(blurs.shape[1] - 1, -1, -1):
         sharp = signed_sharpness / np.sqrt(blurs[0, b] * blurs[0, b] + spread)
-        nats, factors = np.zeros((drops, count)), np.ones((drops, 2, count))
-        lines = np.zeros((drops, 2, count + 1))
-        common = nats[:1], factors[:1], lines[:1]
-        _add_rays(common, same, over[:1], sharp, dark, missing, levels)
-        if drops > 1:
-            if _total(nats[0], factors[0], lines[0]).min() + blurs[1, b] > least + FARTHEST:
-                continue  # the other rays can only add to it
-            nats[1:], factors[1:], lines[1:] = nats[0], factors[0], lines[0]
-        _add_rays((nats, factors, lines), others, over, sharp, dark, missing, levels)
-        for d in range(drops):
-            made[d, b] = _total(nats[d], factors[d], lines[d])
-            least = min(least, made[d, b].min() + blurs[1, b])
+        common = _sums_of(same, over[:1], sharp, dark, missing, levels)[0]
+        # The other rays can only add to it. Negligible levels at the ends are left out.
+        likely = np.flatnonzero(~(common + blurs[1, b] > least + FARTHEST))  # NaN, too
+        if len(likely) == 0:
+            continue
+        low, high = likely[0], likely[-1] + 1
+        part = first + low * step, step, high - low
+        nats = _sums_of(others, over, sharp, dark, missing, part) + common[low:high]
+        made[:, b, low:high] = nats
+        least = min(least, nats.min() + blurs[1, b])
     return made
 
 

@@ -26,7 +26,7 @@ ON_SURFACE_MM = 1e-9
 """Newton's method stops after a shorter step: the next would be far below rounding."""
 
 AT_ONCE = 4
-"""Columns of a matrix that are factorized at once."""
+"""Columns of a matrix that are eliminated at once, from as many columns."""
 
 
 @_inner
@@ -100,8 +100,8 @@ def _accumulate_normal_matrix(
 def _factorize(columns: FloatArray, count: int, width: int) -> bool:
     """Replace the lower band of a matrix by its Cholesky factor; whether it has one.
 
-    Each row of the array holds one column of the band, padded by `AT_ONCE`; so many more rows
-    follow the last. `AT_ONCE` columns are eliminated together, from two columns after them at a
+    Each row of the array holds one column of the band, padded by 2 · `AT_ONCE` zeros; `AT_ONCE`
+    rows follow the last. `AT_ONCE` columns are eliminated together, from as many after them at a
     time: each is read and written less often.
     """
     for j in range(0, count, AT_ONCE):
@@ -117,15 +117,26 @@ def _factorize(columns: FloatArray, count: int, width: int) -> bool:
             for k in range(width + 1):
                 own[k] *= scale
         c0, c1, c2, c3 = columns[j], columns[j + 1], columns[j + 2], columns[j + 3]
-        for t in range(AT_ONCE, min(AT_ONCE + width, count - j), 2):
-            f0, f1, f2, f3 = c0[t], c1[t - 1], c2[t - 2], c3[t - 3]
-            g0, g1, g2, g3 = c0[t + 1], c1[t], c2[t - 1], c3[t - 2]
-            s0, s1, s2, s3 = c0[t + 1 :], c1[t:], c2[t - 1 :], c3[t - 2 :]
-            columns[j + t, 0] -= f0 * f0 + f1 * f1 + f2 * f2 + f3 * f3
-            own, other = columns[j + t, 1:], columns[j + t + 1]
-            for k in range(width + AT_ONCE - 1 - t):
-                own[k] -= f0 * s0[k] + f1 * s1[k] + f2 * s2[k] + f3 * s3[k]
-                other[k] -= g0 * s0[k] + g1 * s1[k] + g2 * s2[k] + g3 * s3[k]
+        for t in range(AT_ONCE, min(AT_ONCE + width, count - j), AT_ONCE):
+            # Row t of the eliminated columns, and the next three.
+            e0, e1, e2, e3 = c0[t], c1[t - 1], c2[t - 2], c3[t - 3]
+            f0, f1, f2, f3 = c0[t + 1], c1[t], c2[t - 1], c3[t - 2]
+            g0, g1, g2, g3 = c0[t + 2], c1[t + 1], c2[t], c3[t - 1]
+            h0, h1, h2, h3 = c0[t + 3], c1[t + 2], c2[t + 1], c3[t]
+            columns[j + t, 0] -= e0 * e0 + e1 * e1 + e2 * e2 + e3 * e3
+            columns[j + t, 1] -= e0 * f0 + e1 * f1 + e2 * f2 + e3 * f3
+            columns[j + t, 2] -= e0 * g0 + e1 * g1 + e2 * g2 + e3 * g3
+            columns[j + t + 1, 0] -= f0 * f0 + f1 * f1 + f2 * f2 + f3 * f3
+            columns[j + t + 1, 1] -= f0 * g0 + f1 * g1 + f2 * g2 + f3 * g3
+            columns[j + t + 2, 0] -= g0 * g0 + g1 * g1 + g2 * g2 + g3 * g3
+            s0, s1, s2, s3 = c0[t + 3 :], c1[t + 2 :], c2[t + 1 :], c3[t:]
+            o0, o1 = columns[j + t, 3:], columns[j + t + 1, 2:]
+            o2, o3 = columns[j + t + 2, 1:], columns[j + t + 3]
+            for k in range(width + 1 - t):
+                o0[k] -= e0 * s0[k] + e1 * s1[k] + e2 * s2[k] + e3 * s3[k]
+                o1[k] -= f0 * s0[k] + f1 * s1[k] + f2 * s2[k] + f3 * s3[k]
+                o2[k] -= g0 * s0[k] + g1 * s1[k] + g2 * s2[k] + g3 * s3[k]
+                o3[k] -= h0 * s0[k] + h1 * s1[k] + h2 * s2[k] + h3 * s3[k]
     return True
 
 
@@ -135,7 +146,7 @@ def normal_factor(
 ) -> tuple[FloatArray, bool]:
     """Cholesky factor of the normal matrix (`solver.normal_factor`), and whether it has one."""
     height, count = stiffness.shape
-    columns = np.zeros((count + AT_ONCE, height + AT_ONCE))
+    columns = np.zeros((count + AT_ONCE, height + 2 * AT_ONCE))
     columns[:count, :height] = stiffness.T
     _accumulate_normal_matrix(grid, points, weights, columns)
     x, y, diagonal = 0.0, 0.0, 0.0
