@@ -133,7 +133,7 @@ def test_negative_index_counts_from_the_last_surface(results: labapp.Results) ->
         lambda s: s.set_settings(Settings(irs=IrsSettings(algorithm="epa-c"))),
         lambda s: s.set_signals("x"),
         lambda s: s.set_limits("x"),
-        lambda s: s.set_laser_entries("x"),
+        lambda s: s.set_entries("laser", "x"),
         lambda s: s.correct(3),
         lambda s: s.import_recording(4),
         lambda s: s.import_recording(RECORDING, 0),

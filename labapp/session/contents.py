@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from labapp.session.frames import Progress
     from labapp.session.record import (
         BenchCheckRecord,
+        BenchEntries,
         LaserEntries,
         LaserReadings,
         PlanePicture,
@@ -123,6 +124,18 @@ class SessionContents:
     def laser_entries(self) -> LaserEntries | None:
         """Readings of the laser's cross that are not applied yet; None if there are none."""
         found: LaserEntries | None = self._documents.get("laser-entries")
+        return found
+
+    @property
+    def plane_entries(self) -> PlanePicture | None:
+        """An imaging-plane calibration that is not applied yet; None if there is none."""
+        found: PlanePicture | None = self._documents.get("plane-entries")
+        return found
+
+    @property
+    def bench_entries(self) -> BenchEntries | None:
+        """Pictures for a bench check that are not applied yet; None if there are none."""
+        found: BenchEntries | None = self._documents.get("bench-entries")
         return found
 
     @property

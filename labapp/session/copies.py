@@ -15,7 +15,7 @@ from urllib.parse import quote
 from labapp.errors import InputError, os_errors_as_input
 from labapp.files import atomic_file
 from labapp.session.creation import new_session
-from labapp.session.documents import Key, Kind
+from labapp.session.documents import PICTURED, Key, Kind
 from labapp.session.file.database import SUFFIX, new_session_path
 from labapp.session.file.schema import NO_FRAME
 from labapp.session.samples import SAMPLES, sample_folder
@@ -26,13 +26,7 @@ BUSY_S = 30.0
 OF_A_RECORDING = ("correction", "signals")
 """Kinds of documents that belong to the recording."""
 
-OF_A_BENCH: tuple[Kind, ...] = (
-    "setup",
-    "laser-entries",
-    "laser-calibration",
-    "plane-calibration",
-    "bench-check",
-)
+OF_A_BENCH: tuple[Kind, ...] = ("setup", *PICTURED)
 """Kinds of documents that belong to the bench."""
 
 

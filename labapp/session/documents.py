@@ -1,7 +1,7 @@
 """Documents of a session, with persistent undo and redo.
 
 A document is a unit of the operator's input: the record, the set-up, the settings, a calibration,
-readings for one, the correction of one frame, the weld's signals, the limits of the sizes. A change
+entries for one, the correction of one frame, the weld's signals, the limits of the sizes. A change
 sets some of them, and stores their former values, in one transaction.
 """
 
@@ -22,6 +22,7 @@ from labapp.session.file.read_cache import ReadCache
 from labapp.session.file.schema import NO_FRAME
 from labapp.session.record import (
     BenchCheckRecord,
+    BenchEntries,
     LaserEntries,
     LaserReadings,
     PlanePicture,
@@ -36,7 +37,9 @@ Kind = Literal[
     "settings",
     "laser-entries",
     "laser-calibration",
+    "plane-entries",
     "plane-calibration",
+    "bench-entries",
     "bench-check",
     "correction",
     "signals",
@@ -51,13 +54,25 @@ CLASSES: dict[str, Any] = {
     "settings": Settings,
     "laser-entries": LaserEntries,
     "laser-calibration": LaserReadings,
+    "plane-entries": PlanePicture,
     "plane-calibration": PlanePicture,
+    "bench-entries": BenchEntries,
     "bench-check": BenchCheckRecord,
     "correction": FrameCorrection,
     "signals": Signals,
     "limits": Limits,
 }
 """Class of a document, by its kind."""
+
+PICTURED: tuple[Kind, ...] = (
+    "laser-entries",
+    "laser-calibration",
+    "plane-entries",
+    "plane-calibration",
+    "bench-entries",
+    "bench-check",
+)
+"""Kinds of documents that may have pictures."""
 
 OnChange = Callable[[Collection[Key]], object]
 
@@ -222,15 +237,15 @@ class Documents:
         )
 
     def pictures(self) -> dict[str, str]:
-        """Return the SHA-256 of the pictures of the calibrations and of the bench check → kind."""
+        """Return the SHA-256 of the pictures of calibrations and bench check → kind."""
         found: dict[str, str] = {}
-        kinds: tuple[Kind, ...] = ("laser-calibration", "plane-calibration", "bench-check")
-        for kind in kinds:
+        for kind in PICTURED:
             with suppress(InputError):  # `problems` reports it
                 document = self.get(kind)
                 for one in getattr(document, "pictures", (document,)):
                     if sha256 := getattr(one, "picture_sha256", None):
                         found[sha256] = kind
+                    found |= dict.fromkeys(getattr(one, "further_sha256", ()), kind)
         return found
 
     def problems(self) -> list[str]:

@@ -78,11 +78,13 @@ class LaserEntries:
     fan_angle_sigma_deg: float
     resolution_mm: float
     """Fan angle, its standard uncertainty and step of the callipers, as in `LaserReadings`."""
+    picture_sha256: str | None = None
+    """The picture of the cross-hair in the session; None if lengths were typed."""
 
 
 @dataclass(frozen=True)
 class PlanePicture:
-    """An imaging-plane calibration (§5.1) and its picture."""
+    """An imaging-plane calibration (§5.1) and its picture; also one that is not applied yet."""
 
     unit_mm: float
     """Length of a unit of the target's axes, or edge of a board's squares, mm."""
@@ -90,6 +92,35 @@ class PlanePicture:
     """Result of the calibration."""
     picture_sha256: str
     """The picture in the session."""
+    further_sha256: tuple[str, ...] = ()
+    """Pictures of the board in other poses, while the calibration is not applied."""
+
+
+@dataclass(frozen=True)
+class MirrorEntry:
+    """A picture for a bench check and the mirror entered for it."""
+
+    name: str
+    kind: str
+    height_mm: float
+    diameter_mm: float | None
+    """Name of the file, and the mirror, as in `MirrorPicture`."""
+    height_sigma_mm: float | None
+    level_sigma_deg: float | None
+    """Standard uncertainties of the height and of a plate's level; None: the usual ones."""
+    picture_sha256: str
+    """The picture in the session."""
+
+
+@dataclass(frozen=True)
+class BenchEntries:
+    """Pictures for a bench check that are not applied yet."""
+
+    pictures: tuple[MirrorEntry, ...]
+
+
+Entries = LaserEntries | PlanePicture | BenchEntries
+"""What was entered for a calibration and is not applied yet."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from labapp.errors import PATH, InputError, check_positive, require, unknown_name
 from labapp.session.contents import SessionContents
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from labapp.media import GreyImage
     from labapp.run.limits import Limits
     from labapp.run.runner import Measurer, Sink
-    from labapp.session.documents import Change, Key
+    from labapp.session.documents import Change, Key, Kind
     from labapp.session.frames import Progress
-    from labapp.session.record import BenchCheckRecord, LaserEntries, Record, Recording
+    from labapp.session.record import BenchCheckRecord, Entries, Record, Recording
     from labapp.session.signals import Signals
 
 
@@ -170,15 +170,48 @@ class Session(SessionContents):
             require(keys, Mapping, "update_setup", section, right)
         self._documents.change(label, {("setup", NO_FRAME): self._updated_setup(values)})
 
-    def set_laser_entries(self, entries: LaserEntries) -> None:
-        """Store readings of the laser's cross until `calibrate_laser` applies some.
+    def set_entries(self, of: Literal["laser", "plane", "bench"], entries: Entries | None) -> None:
+        """Store what was entered for a calibration or a bench check, until one is applied.
 
         Parameters
         ----------
+        of
+            What it is for: ``laser``, ``plane`` or ``bench``.
         entries
-            The readings as they were entered.
+            `LaserEntries`, `PlanePicture` or `BenchEntries`, whose pictures `keep_picture` has
+            stored; None deletes what was entered.
+
+        Raises
+        ------
+        InputError
+            If they are for something else.
         """
-        self._documents.change("laser readings", {("laser-entries", NO_FRAME): entries})
+        kinds: dict[str, tuple[Kind, str]] = {
+            "laser": ("laser-entries", "laser readings"),
+            "plane": ("plane-entries", "imaging-plane points"),
+            "bench": ("bench-entries", "bench-check pictures"),
+        }
+        if of not in kinds:
+            raise unknown_name("set_entries", "of", of, kinds)
+        kind, label = kinds[of]
+        self._documents.change(label, {(kind, NO_FRAME): entries})
+
+    def keep_picture(self, name: str, image: GreyImage) -> str:
+        """Store a picture for a calibration.
+
+        Parameters
+        ----------
+        name
+            Name of the picture.
+        image
+            Grey levels, shape (rows, columns).
+
+        Returns
+        -------
+        str
+            Its SHA-256, by which entries refer to it, and `picture` returns it.
+        """
+        return self._pictures.add(name, image)
 
     def calibrate_laser(
         self,
@@ -335,6 +368,7 @@ class Session(SessionContents):
         keys, (height, width) = found.setup_keys, image.shape
         keys["image_calibration"]["frame_px"] = [width, height]
         values: dict[Key, Any] = {
+            ("plane-entries", NO_FRAME): None,
             ("plane-calibration", NO_FRAME): readings,
             ("setup", NO_FRAME): self._updated_setup(keys),
         }
@@ -362,6 +396,7 @@ class Session(SessionContents):
             for one, image in zip(found.pictures, images, strict=True)
         )
         changed: dict[Key, Any] = {
+            ("bench-entries", NO_FRAME): None,
             ("bench-check", NO_FRAME): replace(found, pictures=pictures),
             ("setup", NO_FRAME): checked_setup(bare, self.path, check, found.date),
         }

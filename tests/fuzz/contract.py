@@ -44,6 +44,7 @@ from tests.fuzz.originals import (
 )
 
 SCHEMES = ("fit", "ers")
+ENTRIES = "laser_entries", "plane_entries", "bench_entries"
 UNREPORTED = "differs, and problems() is silent"
 
 
@@ -106,6 +107,7 @@ def facts(session: Session) -> dict[tuple[Any, ...], Any]:
     for name in (
         *("record", "setup_text", "settings"),
         *("laser_calibration", "plane_calibration", "bench_check"),
+        *ENTRIES,
     ):
         note((name,), functools.partial(_fingerprint_of, session, name))
     numbers = note(("frames",), functools.partial(_numbers, session))
@@ -182,13 +184,15 @@ def look(session: Session, tally: Tally) -> None:
     for name in (
         *("record", "setup_text", "setup", "settings", "laser_calibration", "plane_calibration"),
         *("bench_check", "recording", "missing_recording", "history", "measured_by", "frames"),
+        *ENTRIES,
     ):
         attempt(functools.partial(getattr, session, name))
     attempt(lambda: "\n".join(_text(_facts(session))))
     attempt(lambda: json.dumps(_facts(session)))
-    plane = attempt(lambda: session.plane_calibration)
-    if plane is not None:
-        attempt(lambda: session.picture(plane.picture_sha256))
+    for name in ("plane_calibration", *ENTRIES):
+        stored = attempt(functools.partial(getattr, session, name))
+        for one in getattr(stored, "pictures", (stored,) * (stored is not None)):
+            attempt(functools.partial(session.picture, one.picture_sha256))
     setup = attempt(lambda: session.setup)
     attempt(session.stale_frames)
     numbers = attempt(functools.partial(_numbers, session)) or []
@@ -226,6 +230,7 @@ def change(session: Session, tally: Tally, rng: random.Random) -> None:
         lambda: session.set_settings(dataclasses.replace(session.settings, scheme="ers")),
         lambda: session.correct({0: correction, 1: None}),
         lambda: session.calibrate_laser([13.676], [18.561], [7.874]),
+        lambda: session.set_entries("plane", session.plane_calibration),
         lambda: keep(session, 4, measurement_of(4), "fit"),
         lambda: session.relink(session.path.with_name("recording.npy")),
     ]

@@ -289,7 +289,7 @@ def test_setup_of_another_session_includes_its_calibrations(
     assert calibration is not None
     with Session.create(tmp_path / "new.labsession") as session:
         entries = LaserEntries((("4.6", "", ""),), 10.0, 0.1, 0.05)
-        session.set_laser_entries(entries)
+        session.set_entries("laser", entries)
         use_setup_of(session, other)
         assert (session.setup_text, session.plane_calibration) == (text, calibration)
         assert session.picture(calibration.picture_sha256).ndim == 2

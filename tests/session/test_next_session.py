@@ -29,7 +29,7 @@ def first(tmp_path: Path) -> Path:
         session.set_record(replace(session.record, operator="A. Welder", safety=ticked))
         setup = session.setup_text
         session.calibrate_laser([4.65], [6.23], [2.75], picture=np.eye(30, dtype=np.uint8))
-        session.set_laser_entries(LaserEntries((("4.6", "", ""),), 10.0, 0.1, 0.05))
+        session.set_entries("laser", LaserEntries((("4.6", "", ""),), 10.0, 0.1, 0.05))
         session.set_setup(setup)  # the set-up of the sample, with which the recording was made
         session.set_settings(replace(session.settings, scheme="ers"))
     return path

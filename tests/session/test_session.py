@@ -13,6 +13,7 @@ import pytest
 
 import labapp
 from labapp.config.setup import read_setup
+from labapp.core.calibration.plane_calibration import calibrate_plane
 from labapp.core.pipeline import Settings, start_correction
 from labapp.core.rows.correction import Correction
 from labapp.core.values import CannotMeasure
@@ -20,10 +21,16 @@ from labapp.errors import InputError
 from labapp.export.folder import ExportChoice, verify_export
 from labapp.export.frame_result import FrameResult
 from labapp.export.results import ResultsWriter
-from labapp.media import open_source
+from labapp.media import open_source, read_picture
 from labapp.run.measurers import measuring_pool
 from labapp.session.file.blobs import pack
-from labapp.session.record import LaserEntries, Record
+from labapp.session.record import (
+    BenchEntries,
+    LaserEntries,
+    MirrorEntry,
+    PlanePicture,
+    Record,
+)
 from labapp.session.results.measured import CORRECTION_CHANGED, SETTINGS_CHANGED, SETUP_CHANGED
 from labapp.session.session import Session
 from tests.scripts import run_python
@@ -456,7 +463,7 @@ def test_laser_calibration_changes_the_rig_until_undo(session: Session):
 def test_laser_entries_are_kept_until_some_are_applied(session: Session):
     entries = LaserEntries((("13,7", "", "7.9"), ("x", "18.5", "")), 10.0, 0.1, 0.02)
     assert session.laser_entries is None
-    session.set_laser_entries(entries)
+    session.set_entries("laser", entries)
     session.close()
     with Session.open(session.path) as reopened:
         assert reopened.laser_entries == entries
@@ -467,6 +474,54 @@ def test_laser_entries_are_kept_until_some_are_applied(session: Session):
         reopened.undo()
         assert reopened.laser_entries == entries
         assert reopened.problems() == []
+
+
+def test_plane_entries_are_kept_until_a_plane_is_applied(session: Session):
+    image = read_picture(SAMPLE / "calibration.png")
+    found = calibrate_plane(image, 6.35)
+    keys = [session.keep_picture(f"{n}.png", image[n:]) for n in range(2)]
+    entries = PlanePicture(6.35, found, keys[0], (keys[1],))
+    session.set_entries("plane", entries)
+    setup = session.setup_text
+    session.close()
+    with Session.open(session.path) as reopened:
+        assert reopened.plane_entries == entries
+        assert reopened.plane_calibration is None
+        assert reopened.setup_text == setup
+        np.testing.assert_array_equal(reopened.picture(keys[1]), image[1:])
+        reopened.use_plane(found, 6.35, image)
+        assert reopened.plane_entries is None
+        assert reopened.problems() == []
+        reopened.undo()
+        assert reopened.plane_entries == entries
+        assert reopened.problems() == []
+
+
+def test_pictures_for_a_bench_check_are_kept_until_one_is_applied(session: Session):
+    image = np.full((30, 40), 7, np.uint8)
+    mirror = MirrorEntry("a.png", "cap", 0.9, 9.8, 0.01, None, session.keep_picture("a", image))
+    session.set_entries("bench", BenchEntries((mirror,)))
+    session.close()
+    with Session.open(session.path) as reopened:
+        assert reopened.bench_entries == BenchEntries((mirror,))
+        assert reopened.bench_check is None
+        np.testing.assert_array_equal(reopened.picture(mirror.picture_sha256), image)
+        reopened.set_entries("bench", None)
+        assert reopened.bench_entries is None
+
+
+def test_missing_pictures_of_entries_are_problems(session: Session):
+    unknown, found = "0" * 64, calibrate_plane(read_picture(SAMPLE / "calibration.png"), 6.35)
+    known = session.keep_picture("a", np.zeros((30, 40), np.uint8))
+    mirror = MirrorEntry("a", "plate", 0.0, None, None, None, unknown)
+    session.set_entries("laser", LaserEntries((), 10.0, 0.1, 0.02, unknown))
+    assert len(session.problems()) == 1
+    session.set_entries("laser", None)
+    session.set_entries("plane", PlanePicture(6.35, found, known, (unknown,)))
+    assert len(session.problems()) == 1
+    session.set_entries("plane", None)
+    session.set_entries("bench", BenchEntries((mirror,)))
+    assert len(session.problems()) == 1
 
 
 def test_plane_calibration_stores_its_picture(session: Session):

@@ -173,11 +173,15 @@ def _setup(facts: Facts) -> State:
 
 
 def _laser(facts: Facts) -> State:
+    if facts.session.laser_entries is not None:
+        return State(Mark.READY, "The entered readings wait to be applied")
     used, _ = calibrations_in_use(facts.session)
     return _calibrated(facts, facts.session.laser_calibration, used, facts.lacks("laser"))
 
 
 def _plane(facts: Facts) -> State:
+    if facts.session.plane_entries is not None:
+        return State(Mark.READY, "The points in the picture wait to be applied")
     _, used = calibrations_in_use(facts.session)
     return _calibrated(
         facts, facts.session.plane_calibration, used, facts.lacks("image_calibration")
@@ -201,6 +205,10 @@ def _bench_check(facts: Facts) -> State:
         return State(Mark.TODO, why)
     if facts.problems:
         return State(Mark.TODO, f"Set-up: {facts.to_do}")
+    entries = facts.session.bench_entries
+    if entries is not None and entries.pictures:
+        count = pluralize(len(entries.pictures), "picture")
+        return State(Mark.READY, f"{count} of mirrors wait to be checked and applied")
     if facts.checked:
         return State(Mark.DONE, f"Checked against a known mirror on {facts.checked[:10]}")
     if kept is not None:

@@ -36,10 +36,13 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
 
     moved = Signal(float, float)
     """The point was or is being moved by the operator: u, v, px."""
+    placed = Signal()
+    """The operator has finished moving it: the button or the arrow key is released."""
 
     def __init__(self, name: str, u: float, v: float, color: str = "#ffb000") -> None:
         self.name = name
         self._color = QColor(color)
+        self._nudged = False
         super().__init__(
             pos=(u, v),
             size=15,
@@ -51,6 +54,7 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
         )
         self.setToolTip(f"{name}: drag it, or use the arrow keys (Shift: {FAR_NUDGE_PX:g} px)")
         self.sigPositionChanged.connect(lambda *_: self.moved.emit(*self.place))
+        self.sigPositionChangeFinished.connect(lambda *_: self.placed.emit())
 
     @property
     def place(self) -> tuple[float, float]:
@@ -70,6 +74,13 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
             return
         u, v = self.place
         self.setPos(u + du, v + dv)
+        self._nudged = True
+
+    def release(self) -> None:
+        """End a move by the arrow keys, if there is one."""
+        if self._nudged:
+            self._nudged = False
+            self.placed.emit()
 
     def show_chosen(self, chosen: bool) -> None:
         """Show whether the arrow keys move the point."""

@@ -365,15 +365,20 @@ class PictureView(Drawn):
             super().keyPressEvent(event)
 
     def keyReleaseEvent(self, event: QKeyEvent) -> None:
-        """Notify the tool."""
+        """Notify the tool and the selected point."""
         if not event.isAutoRepeat():
-            self.tool.release()
+            self._release()
         super().keyReleaseEvent(event)
 
     def focusOutEvent(self, event: QFocusEvent) -> None:
-        """Notify the tool: the key may be released elsewhere."""
-        self.tool.release()
+        """Notify the tool and the selected point: the key may be released elsewhere."""
+        self._release()
         super().focusOutEvent(event)
+
+    def _release(self) -> None:
+        self.tool.release()
+        if self._current is not None:
+            self._current.release()
 
     def _step(self, event: QKeyEvent) -> tuple[float, float] | None:
         """Step of an arrow key, px; without a selected point only with Shift, which pans."""

@@ -43,8 +43,10 @@ from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.run.limits import Limits
 from labapp.session.record import (
     BenchCheckRecord,
+    BenchEntries,
     LaserEntries,
     LaserReadings,
+    MirrorEntry,
     MirrorPicture,
     PlanePicture,
     Record,
@@ -182,6 +184,8 @@ STORED = {
     "LaserReadings": Stored(LaserReadings),
     "LaserCalibration": Stored(LaserCalibration),
     "PlanePicture": Stored(PlanePicture),
+    "BenchEntries": Stored(BenchEntries),
+    "MirrorEntry": Stored(MirrorEntry),
     "PlaneCalibration": Stored(PlaneCalibration, fits=_plane_fits),
     "BoardCalibration": Stored(BoardCalibration, fits=_boards_fit),
     "BoardCorners": Stored(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import tomllib
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from labapp.core.bench_check.suspects import Suspect
 from labapp.core.geometry.uncertainty import INDEX
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.values import CannotMeasure
+from labapp.errors import InputError
 from labapp.gui.pages.bench_check import presenter
 from labapp.gui.pages.bench_check.page import BenchCheckPage
 from labapp.gui.pages.bench_check.presenter import CheckResult, ListedPicture
@@ -212,10 +214,11 @@ def test_picture_of_another_size_is_rejected(tmp_path: Path) -> None:
 # --- the page -----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[BenchCheckPage]:
+@contextmanager
+def page_of(path: Path, qtbot: QtBot) -> Iterator[BenchCheckPage]:
+    """The page alone, of a session that is open nowhere else."""
     workspace = Workspace()
-    workspace.show(Session.open(copy_sample("gtaw")))
+    workspace.show(Session.open(path))
     bench_page = BenchCheckPage(workspace)
     KEPT.extend([workspace, bench_page, bench_page.panel])
     workspace.changed.connect(lambda: bench_page.refresh() if workspace.session else None)
@@ -227,6 +230,12 @@ def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[BenchChec
     workspace.close()
     bench_page.hide()
     bench_page.panel.hide()
+
+
+@pytest.fixture
+def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[BenchCheckPage]:
+    with page_of(copy_sample("gtaw"), qtbot) as bench_page:
+        yield bench_page
 
 
 def add(qtbot: QtBot, page: BenchCheckPage, folder: Path, *images: GreyImage) -> None:
@@ -256,6 +265,47 @@ def test_pictures_are_listed_edited_and_removed(
     page.remove_button.click()
     assert [one.mirror for one in page.chosen] == [Plate(0.0)]
     assert not page.mirror_form.diameter.editor.isEnabled()
+
+
+def test_pictures_are_stored_with_the_session_until_applied(
+    qtbot: QtBot, copy_sample: Callable[[str], Path], tmp_path: Path
+) -> None:
+    path, images = copy_sample("gtaw"), [np.full((64, 48), n, np.uint8) for n in (10, 20)]
+    with page_of(path, qtbot) as page:
+        add(qtbot, page, tmp_path, *images)
+        page.mirror_form.kind.edited.emit("ball")
+        page.mirror_form.diameter.edited.emit(8.0)
+        page.mirror_form.height_sigma.edited.emit(0.02)
+        setup, words = page.session.setup_text, [one.mirror for one in page.chosen]
+    for picture in tmp_path.glob("mirror*.png"):
+        picture.unlink()
+    with page_of(path, qtbot) as page:
+        assert [one.mirror for one in page.chosen] == words
+        for one, image in zip(page.chosen, images, strict=True):
+            np.testing.assert_array_equal(one.image, image)
+        assert page.session.setup_text == setup
+        assert page.session.bench_check is None
+        assert "2 pictures" in states(page.session)["bench_check"].why
+        page.workspace.undo()
+        qtbot.waitUntil(lambda: page.chosen[1].height_sigma_mm is None)
+        page.list.selectRow(0)
+        page.remove_button.click()
+        page.remove_button.click()
+        assert page.session.bench_entries is None
+        page.workspace.undo()
+        qtbot.waitUntil(lambda: len(page.chosen) == 1)
+        np.testing.assert_array_equal(page.chosen[0].image, images[1])
+
+
+def test_pictures_that_cannot_be_stored_stay(
+    qtbot: QtBot, page: BenchCheckPage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise InputError(page.session.path, "disk", "no space left", "room on the disk")
+
+    monkeypatch.setattr(Session, "set_entries", fail)
+    add(qtbot, page, tmp_path, np.zeros((64, 48), np.uint8))
+    assert len(page.chosen) == 1
 
 
 def test_entered_uncertainties_can_be_cleared(
@@ -343,7 +393,9 @@ def test_bench_check_is_applied_stored_and_undone(
     not_used = page.state(states(session)["bench_check"])
     assert not_used.mark is Mark.READY
     assert not_used != states(session)["bench_check"]
+    assert session.bench_entries is not None
     page.use_button.click()
+    assert session.bench_entries is None
     assert page.state(states(session)["bench_check"]).mark is Mark.DONE
     setup = session.setup
     assert setup.rig.uncertainty is not None

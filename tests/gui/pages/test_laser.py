@@ -18,7 +18,7 @@ from labapp.errors import InputError
 from labapp.gui.pages.laser import presenter
 from labapp.gui.pages.laser.page import LaserPage
 from labapp.gui.pages.laser.presenter import ENDS, SCALE, Readings
-from labapp.gui.shell.steps import states
+from labapp.gui.shell.steps import Mark, states
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tasks import DONE
 from labapp.gui.workspace import Workspace
@@ -286,7 +286,7 @@ def test_readings_that_cannot_be_stored_stay(
 
     clear(page)
     with monkeypatch.context() as patch:
-        patch.setattr(Session, "set_laser_entries", fail)
+        patch.setattr(Session, "set_entries", fail)
         fill(page, 0, ("1", "2", ""))
         assert page.readings().lengths_mm == ((1.0,), (2.0,), ())
     fill(page, 0, ("1", "2", "3"))
@@ -335,6 +335,7 @@ def test_picture_gives_a_reading_and_is_stored(
 ) -> None:
     session = page.workspace.session
     assert session is not None
+    not_calibrated = states(session)["laser"]
     image = np.full((600, 800), 40, np.uint8)
     cv2.imwrite(str(tmp_path / "cross.png"), image)
     clear(page)
@@ -350,11 +351,21 @@ def test_picture_gives_a_reading_and_is_stored(
     assert page.lengths.text() == "l₁ 13.68 mm,  l₂ 18.56 mm,  l₃ 7.87 mm"
     page.add_button.click()
     assert page.readings().lengths_mm == ((13.68,), (18.56,), (7.87,))
-    page.use_button.click()
-    calibration = session.laser_calibration
-    assert calibration is not None
-    assert calibration.picture_sha256 is not None
-    np.testing.assert_array_equal(session.picture(calibration.picture_sha256), image)
+    path = session.path
+    page.workspace.close()
+    with page_of(path) as again:  # the readings, and the picture, are stored until applied
+        assert states(again.session)["laser"].mark is Mark.READY
+        assert states(again.session)["laser"] != not_calibrated
+        again.use_button.click()
+        calibration = again.session.laser_calibration
+        assert calibration is not None
+        assert calibration.picture_sha256 is not None
+        np.testing.assert_array_equal(again.session.picture(calibration.picture_sha256), image)
+        assert states(again.session)["laser"].mark is Mark.DONE
+        fill(again, 0, ("13.7",))
+        assert again.session.laser_entries is not None
+        fill(again, 0, ("13.68",))
+        assert again.session.laser_entries is not None  # no longer from the picture
 
 
 def test_picture_of_another_session_is_removed(

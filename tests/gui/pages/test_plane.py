@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,13 +22,15 @@ from labapp.core.calibration.boards import BOARDS
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
-from labapp.gui.pages.plane import page as plane_page_module
+from labapp.errors import InputError
+from labapp.gui.pages import kept_picture
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.page import PlanePage
-from labapp.gui.shell.steps import states
+from labapp.gui.shell.steps import Mark, states
 from labapp.gui.tasks import DONE
 from labapp.gui.workspace import Workspace
 from labapp.session.calibrations import calibrations_in_use
+from labapp.session.file.blobs import fingerprint
 from labapp.session.session import Session
 from labapp.simulation.calibration.board import board_svg
 from labapp.simulation.calibration.target import Target, TargetLook, render_target, target_svg
@@ -177,10 +181,11 @@ def test_picture_without_a_target_is_rejected() -> None:
 # --- the page ---------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[PlanePage]:
+@contextmanager
+def page_of(path: Path, qtbot: QtBot) -> Iterator[PlanePage]:
+    """The page alone, of a session that is open nowhere else."""
     workspace = Workspace()
-    workspace.show(Session.open(copy_sample("gtaw")))
+    workspace.show(Session.open(path))
     plane_page = PlanePage(workspace)
     KEPT.extend([workspace, plane_page, plane_page.panel])
     workspace.changed.connect(lambda: plane_page.refresh() if workspace.session else None)
@@ -189,9 +194,16 @@ def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[PlanePage
     plane_page.panel.show()
     qtbot.waitUntil(lambda: not workspace.tasks.active)
     yield plane_page
+    plane_page.leave()
     workspace.close()
     plane_page.hide()
     plane_page.panel.hide()
+
+
+@pytest.fixture
+def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[PlanePage]:
+    with page_of(copy_sample("gtaw"), qtbot) as plane_page:
+        yield plane_page
 
 
 def test_target_is_saved_for_printing(page: PlanePage, tmp_path: Path) -> None:
@@ -301,7 +313,7 @@ def test_the_picture_chosen_last_is_shown(
             return first
         return last
 
-    monkeypatch.setattr(plane_page_module, "read_picture", read)
+    monkeypatch.setattr(kept_picture, "read_picture", read)
     page.load(Path("first.png"))
     page.load(Path("last.png"))
     qtbot.waitUntil(lambda: page.view.picture is last)
@@ -396,15 +408,122 @@ def test_applied_calibration_equals_the_shown_one_exactly(
     assert used == pytest.approx(shown, rel=1e-12)
 
 
+def done_steps(session: Session) -> int:
+    return sum(not change.undone for change in session.history)
+
+
+def load(qtbot: QtBot, page: PlanePage, path: Path) -> None:
+    page.load(path)
+    qtbot.waitUntil(lambda: page.session.plane_entries is not None)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+
+
+def test_points_are_stored_with_the_session_until_applied(
+    qtbot: QtBot, copy_sample: Callable[[str], Path], tmp_path: Path
+) -> None:
+    path, picture = copy_sample("gtaw"), tmp_path / "target.png"
+    image = cv2.imread(str(GTAW / "calibration.png"), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    cv2.imwrite(str(picture), np.roll(image, 3, axis=1))
+    with page_of(path, qtbot) as page:
+        setup, applied, steps = page.session.setup_text, page.found, done_steps(page.session)
+        load(qtbot, page, picture)
+        qtbot.keyClick(page.view, Qt.Key.Key_P)
+        for _ in range(3):
+            qtbot.keyPress(page.view, Qt.Key.Key_Right)
+        qtbot.keyRelease(page.view, Qt.Key.Key_Right)
+        placed = page.found
+        page.unit.edited.emit(6.35)  # as it was
+        assert done_steps(page.session) == steps + 2  # a held key is one step
+        page.drag(1, 100.0, 200.0)  # the button is still held
+        dragged = page.found
+        assert placed is not None
+        assert dragged != placed
+    picture.unlink()
+    with page_of(path, qtbot) as page:
+        assert page.found == dragged
+        np.testing.assert_array_equal(page.view.picture, np.roll(image, 3, axis=1))
+        assert page.session.setup_text == setup
+        assert not page.applied.text().startswith(DONE)
+        assert states(page.session)["plane"].mark is Mark.READY
+        page.workspace.undo()
+        qtbot.waitUntil(lambda: page.found == placed)
+        page.use_button.click()
+        qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+        assert page.session.plane_entries is None
+        assert page.applied.text().startswith(DONE)
+        assert page.found == placed
+        page.workspace.undo()  # of Apply: what was placed stays, so that it can be corrected
+        qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+        assert page.found == placed
+        page.kept_button.click()
+        qtbot.waitUntil(lambda: page.found == applied)
+        assert page.session.plane_entries is None
+        assert states(page.session)["plane"].mark is Mark.DONE
+
+
+def test_unplaced_points_are_stored_as_such(
+    qtbot: QtBot, copy_sample: Callable[[str], Path], tmp_path: Path
+) -> None:
+    path = copy_sample("gtaw")
+    cv2.imwrite(str(tmp_path / "bare.png"), np.full((200, 300), 90, np.uint8))
+    with page_of(path, qtbot) as page:
+        page.load(tmp_path / "bare.png")
+        qtbot.waitUntil(lambda: page.answer.text() != "")
+        page.points[0].setPos(20.0, 180.0)
+        page.points[0].placed.emit()
+        waiting = presenter.result(page.found).why_not
+        assert waiting
+        page.drag(1, 20.0, 180.0)  # on one line, at one place: no calibration
+    with page_of(path, qtbot) as page:
+        assert page.points[0].place == (20.0, 180.0)
+        assert presenter.result(page.found).why_not == waiting
+        assert not page.use_button.isEnabled()
+
+
+def test_points_that_cannot_be_stored_stay(
+    qtbot: QtBot, page: PlanePage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise InputError(page.session.path, "disk", "no space left", "room on the disk")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, "set_entries", fail)
+        page.points[0].setPos(60.0, 70.0)
+        page.points[0].placed.emit()
+        assert page.points[0].place == (60.0, 70.0)
+    assert page.session.plane_entries is None
+    page.points[0].placed.emit()
+    assert page.session.plane_entries is not None
+
+
+def test_nothing_is_stored_in_a_session_that_is_read_only(
+    qtbot: QtBot, page: PlanePage, tmp_path: Path
+) -> None:
+    path = page.session.path
+    page.workspace.close()
+    before = path.read_bytes()
+    page.workspace.show(Session.open(path, read_only=True))
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    shutil.copy(GTAW / "calibration.png", tmp_path / "again.png")
+    former = page.view.picture
+    page.load(tmp_path / "again.png")
+    qtbot.waitUntil(lambda: page.view.picture is not former)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    page.leave()
+    assert page.answer.text() == ""
+    assert path.read_bytes() == before
+
+
 def test_every_button_has_a_tooltip(page: PlanePage) -> None:
     buttons = page.panel.findChildren(QPushButton)
     assert len(buttons) == 6
     assert all(button.toolTip() for button in buttons)
 
 
-def board_picture(path: Path) -> Path:
+def board_picture(path: Path, turned_deg: tuple[float, float, float] = (1, -2, 1.3)) -> Path:
     """A picture of a board through a lens with 1 % distortion."""
-    view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(1, -2, 1.3), lens=Lens(1000.0, k1=-0.06))
+    view = PosedView.at((40.0, 36.0), 5.0, turned_deg=turned_deg, lens=Lens(1000.0, k1=-0.06))
     printed, rng = InkedBoard(BOARDS["charuco_4_inch"]), np.random.default_rng(1)
     cv2.imwrite(str(path), render_target(printed, view, TargetLook(), rng))
     return path
@@ -439,6 +558,33 @@ def test_board_is_detected_applied_and_undone(
     assert lens_of(session.setup_text) is not None
     session.undo()
     assert session.setup_text == before
+
+
+@pytest.mark.slow
+def test_all_pictures_of_a_board_are_stored_until_applied(
+    qtbot: QtBot, copy_sample: Callable[[str], Path], tmp_path: Path
+) -> None:
+    path = copy_sample("gtaw")
+    with page_of(path, qtbot) as page:
+        load(qtbot, page, board_picture(tmp_path / "board.png"))
+        first = page.found
+        page.add_picture(board_picture(tmp_path / "further.png", turned_deg=(9, -9, 1.3)))
+        qtbot.waitUntil(lambda: page.found is not first)
+        qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+        found = page.found
+        assert isinstance(found, BoardCalibration)
+        assert len(found.seen) == 2
+    with page_of(path, qtbot) as page:
+        assert fingerprint(page.found) == fingerprint(found)
+        page.find_button.click()  # in both pictures
+        qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+        assert fingerprint(page.found) == fingerprint(found)
+        page.use()
+        qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+        assert page.applied.text().startswith(DONE)
+        page.load(board_picture(tmp_path / "other.png", turned_deg=(3, 2, 0)))
+        qtbot.waitUntil(lambda: page.session.plane_entries is not None)
+        assert page.applied.text() == ""
 
 
 def test_board_is_saved_for_printing(page: PlanePage, tmp_path: Path) -> None:

@@ -18,9 +18,10 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.bench_check import presenter
-from labapp.gui.pages.bench_check.listed_picture import ListedPicture, kept_pictures
+from labapp.gui.pages.bench_check.listed_picture import ListedPicture, enter, stored_pictures
 from labapp.gui.pages.bench_check.mirror_form import MirrorForm
 from labapp.gui.pages.bench_check.presenter import COLUMNS, CheckResult, Predicted
+from labapp.gui.pages.kept_picture import KeptPicture, load_picture
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import Lead, Mark, Offer, State, no_bench_check, setup_to_do
 from labapp.gui.tasks import Control
@@ -38,8 +39,7 @@ from labapp.gui.widgets.labels import (
 from labapp.gui.widgets.layouts import column_of, fill, hbox
 from labapp.gui.widgets.tables import FullTable, ReadTable
 from labapp.gui.workspace import Workspace
-from labapp.media import read_picture
-from labapp.session.record import BenchCheckRecord, MirrorPicture
+from labapp.session.record import BenchCheckRecord, BenchEntries, MirrorPicture
 
 NO_PICTURE = "Put a known mirror where the pool will be; add a picture of its dots, or drop it."
 
@@ -63,6 +63,7 @@ class BenchCheckPage(Page):
         self.checked: CheckResult | None = None
         self.answer = Message(4)
         self._path: Path | None = None
+        self._entries: BenchEntries | None = None
         self._kept: BenchCheckRecord | None = None
         self._found: MirrorPicture | None = None
         self.view = PictureView("Picture of the mirror")
@@ -99,19 +100,28 @@ class BenchCheckPage(Page):
         self.splitter.setSizes([size - table, table])
 
     def refresh(self) -> None:
-        """Show the stored check if it changed."""
-        session, kept = self.session, self.session.bench_check
+        """Show pictures that did not change on this page, and the stored check."""
+        session = self.session
+        entries, kept = session.bench_entries, session.bench_check
         if session.path != self._path:
-            self._path, self._kept, self.checked = session.path, None, None
+            self._path, self._entries, self._kept = session.path, None, None
+            self.checked = None
             self._show_predicted(None)
             self._list(())
+        is_changed = kept is not self._kept or entries != self._entries
         if kept is not self._kept:
-            self._kept = kept
             self.answer.setText("")
-            if kept is not None and not self._is_kept():
-                self.checked = None
-                self._take_kept()
+        self._entries, self._kept = entries, kept
+        # What could not be stored stays.
+        if is_changed and not self._is_stored():
+            self._take_stored()
         self._follow()
+
+    def _is_stored(self) -> bool:
+        """Whether the list is that of the session."""
+        if self._entries is None:
+            return self._is_kept() or not (self._kept or self.chosen)
+        return self._entries.pictures == tuple(one.entry for one in self.chosen)
 
     @property
     def locked(self) -> str:
@@ -141,28 +151,33 @@ class BenchCheckPage(Page):
         kept = self._kept
         return bool(self.checked and kept and self.checked.record.date == kept.date)
 
-    def _take_kept(self) -> None:
-        session, kept = self.session, self._kept
+    def _take_stored(self) -> None:
+        session, entries, kept = self.session, self._entries, self._kept
 
         def shown(chosen: Sequence[ListedPicture]) -> None:
-            if session.bench_check is kept:
+            if self._entries is entries and self._kept is kept:
                 self._list(chosen)
 
         title = "Showing the pictures of the check"
-        self.workspace.tasks.start(title, lambda _: kept_pictures(session), shown)
+        self.workspace.tasks.start(title, lambda _: stored_pictures(session), shown)
+
+    def _enter(self, chosen: Sequence[ListedPicture], at: int = 0) -> None:
+        """Show a list that the operator changed, and store it until it is applied."""
+        self._list(chosen, at)
+        self.workspace.attempt(lambda session: enter(session, chosen))
 
     # --- the list -----------------------------------------------------------------------------
 
     def load(self, *paths: Path) -> None:
         """Add pictures, initially of a plate."""
+        session = self.session
 
-        def loaded(pictures: Sequence[ListedPicture]) -> None:
-            self._list([*self.chosen, *pictures], len(self.chosen))
+        def loaded(pictures: Sequence[KeptPicture]) -> None:
+            added = [ListedPicture(one.name, one.image, sha256=one.sha256) for one in pictures]
+            self._enter([*self.chosen, *added], len(self.chosen))
 
         self.start_task(
-            "Loading the picture",
-            lambda _: [ListedPicture(path.name, read_picture(path)) for path in paths],
-            loaded,
+            "Loading the picture", lambda _: [load_picture(session, path) for path in paths], loaded
         )
 
     def takes_files(self, paths: Sequence[Path]) -> bool:
@@ -180,12 +195,12 @@ class BenchCheckPage(Page):
         """Remove the selected picture from the list."""
         if self.chosen:
             at = self._at()
-            self._list([one for k, one in enumerate(self.chosen) if k != at], max(0, at - 1))
+            self._enter([one for k, one in enumerate(self.chosen) if k != at], max(0, at - 1))
 
     def change(self, one: ListedPicture) -> None:
         """Change the mirror of the selected picture."""
         at = self._at()
-        self._list([one if k == at else other for k, other in enumerate(self.chosen)], at)
+        self._enter([one if k == at else other for k, other in enumerate(self.chosen)], at)
 
     def _at(self) -> int:
         return max(0, min(self.list.currentRow(), len(self.chosen) - 1))

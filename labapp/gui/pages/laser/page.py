@@ -10,6 +10,7 @@ from PySide6.QtWidgets import QHeaderView, QStackedWidget, QTableWidget, QTableW
 
 from labapp.core.calibration.laser_calibration import LaserCalibrationSettings
 from labapp.gui.dialogs import ask_file
+from labapp.gui.pages.kept_picture import KeptPicture, load_picture
 from labapp.gui.pages.laser import presenter
 from labapp.gui.pages.laser.presenter import ENDS, MEANINGS, NAMES, SCALE, Place, Readings
 from labapp.gui.pages.page import Page
@@ -24,7 +25,6 @@ from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import RIGHT
 from labapp.gui.workspace import Workspace
-from labapp.media import GreyImage, read_picture
 from labapp.session.record import LaserEntries
 
 WAYS = (("callipers", "by callipers"), ("picture", "from a picture"))
@@ -58,7 +58,8 @@ class LaserPage(Page):
             self.canvas.addWidget(view)
         self.canvas_layout.addWidget(self.canvas)
         self._points: dict[str, DragPoint] = {}
-        self._from_picture: GreyImage | None = None
+        self._picture: KeptPicture | None = None
+        self._from_sha256: str | None = None
         self._stored: tuple[Path, LaserEntries] | None = None
         self._make_panel()
         self._show_way("callipers")
@@ -70,7 +71,6 @@ class LaserPage(Page):
         is_same_session = former is not None and former[0] == self.session.path
         # What could not be stored stays.
         if self._stored != former and not (is_same_session and entries == self.entries()):
-            self._from_picture = None
             self._fill(entries)
         self.in_use.set_rows(presenter.in_use(self.session))
         self._follow()
@@ -98,33 +98,30 @@ class LaserPage(Page):
             cells.pop()
         fan_angle_deg = self.fan.value() or presenter.FAN_ANGLE_DEG
         known = self.fan_sigma.value() or 0.0, self.resolution.value() or 0.0
-        return LaserEntries(tuple(cells), fan_angle_deg, *known)
+        return LaserEntries(tuple(cells), fan_angle_deg, *known, self._from_sha256)
 
     def load_picture(self, path: Path) -> None:
         """Show a picture of the cross with points to drag."""
+        session = self.session
         self.start_latest(
-            "Loading the picture", path, lambda _: read_picture(path), self._show_picture
+            "Loading the picture", path, lambda _: load_picture(session, path), self._show_picture
         )
 
     def add_reading(self) -> None:
         """Add the lengths from the picture to the table as another reading."""
         lengths = self._cross()
-        if lengths is None:
+        if lengths is None or self._picture is None:
             return
         rows = range(self.table.rowCount())
         row = next(r for r in rows if not any(self._line(r)))
         self._put(row, [f"{length:.2f}" for length in lengths])
-        self._from_picture = self.picture_view.picture
+        self._from_sha256 = self._picture.sha256
         self._store()
 
     def use(self) -> None:
         """Use the resulting laser in the rig."""
-        readings, picture = self.readings(), self._from_picture
-        if self.workspace.attempt(
-            lambda session: session.calibrate_laser(
-                *readings.lengths_mm, readings.fan_angle_deg, picture, readings.settings
-            )
-        ):
+        readings, sha256 = self.readings(), self._from_sha256
+        if self.workspace.attempt(lambda session: presenter.apply(session, readings, sha256)):
             words = "Applied to the set-up; undo restores the former laser"
             self.workspace.notified.emit(words, False)
 
@@ -208,6 +205,7 @@ class LaserPage(Page):
     # --- the readings -----------------------------------------------------------------------
 
     def _fill(self, entries: LaserEntries) -> None:
+        self._from_sha256 = entries.picture_sha256
         with QSignalBlocker(self.table):
             self.table.setRowCount(0)
             self.table.setRowCount(max(LEAST_ROWS, len(entries.cells) + 1))
@@ -234,7 +232,7 @@ class LaserPage(Page):
     def _cell_changed(self, item: QTableWidgetItem) -> None:
         with QSignalBlocker(self.table):
             item.setTextAlignment(RIGHT)
-        self._from_picture = None
+        self._from_sha256 = None
         self._grow()
         self._store()
 
@@ -287,8 +285,9 @@ class LaserPage(Page):
         if path := ask_file(self, "Picture of the cross hair", self.workspace.folder):
             self.load_picture(path)
 
-    def _show_picture(self, image: GreyImage | None) -> None:
-        former = self.picture_view.picture
+    def _show_picture(self, picture: KeptPicture | None) -> None:
+        self._picture, former = picture, self.picture_view.picture
+        image = None if picture is None else picture.image
         self.picture_view.show_picture(image, NO_PICTURE)
         for point in self._points.values():
             point.setVisible(image is not None)

@@ -122,10 +122,12 @@ def kept(session: Session) -> Readings | None:
 
 def entries(session: Session) -> LaserEntries:
     """Entries that are not applied yet; without any, those of the calibration in use."""
-    entered = session.laser_entries
-    if entered is not None:
-        return entered
-    readings = kept(session) or Readings()
+    return session.laser_entries or applied_entries(session)
+
+
+def applied_entries(session: Session) -> LaserEntries:
+    """Entries as they are in the table after Apply; empty ones without a calibration."""
+    calibration, readings = session.laser_calibration, kept(session) or Readings()
     l1, l2, l3 = (map(length_text, lengths) for lengths in readings.lengths_mm)
     settings = readings.settings
     return LaserEntries(
@@ -133,13 +135,21 @@ def entries(session: Session) -> LaserEntries:
         readings.fan_angle_deg,
         settings.fan_angle_sigma_deg,
         settings.resolution_mm,
+        None if calibration is None else calibration.picture_sha256,
     )
 
 
 def enter(session: Session, entered: LaserEntries) -> None:
-    """Store entries until they are applied, unless the session has them."""
-    if entered != entries(session):
-        session.set_laser_entries(entered)
+    """Store entries until they are applied, unless they are those in use."""
+    session.set_entries("laser", None if entered == applied_entries(session) else entered)
+
+
+def apply(session: Session, readings: Readings, picture_sha256: str | None) -> None:
+    """Calibrate the laser by readings, and by the picture from which they are, if there is one."""
+    picture = session.picture(picture_sha256) if picture_sha256 else None
+    session.calibrate_laser(
+        *readings.lengths_mm, readings.fan_angle_deg, picture, readings.settings
+    )
 
 
 def is_in_use(session: Session, readings: Readings) -> bool:

@@ -15,6 +15,7 @@ from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.files import write_file
 from labapp.gui.dialogs import ask_file, ask_save
+from labapp.gui.pages.kept_picture import KeptPicture, load_picture
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.presenter import POINTS
@@ -28,7 +29,8 @@ from labapp.gui.widgets.labels import Message, offer, plain_label, show_words, w
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
-from labapp.media import GreyImage, read_picture
+from labapp.session.file.blobs import fingerprint
+from labapp.session.record import PlanePicture
 from labapp.simulation.calibration.board import board_pdf, board_svg
 from labapp.simulation.calibration.target import Target, target_svg
 
@@ -58,9 +60,8 @@ class PlanePage(Page):
         self.view.show_picture(None)
         self.canvas_layout.addWidget(self.view)
         self.found: Calibration | None = None
-        self._tilted: tuple[GreyImage, ...] = ()
-        self._name = "picture"
-        self._loaded: object = None
+        self._pictures: tuple[KeptPicture, ...] = ()
+        self._stored: tuple[Path, str] | None = None
         self._finding: Task | None = None
         self._axes = pg.PlotDataItem(pen=pg.mkPen(COLOR, width=1.5))
         self._marks = pg.PlotDataItem(
@@ -71,69 +72,100 @@ class PlanePage(Page):
         self._make_panel()
 
     def refresh(self) -> None:
-        """Show changed picture and points in use, and the values in use."""
-        kept = self.session.plane_calibration
-        loaded = (self.session.path, kept)
-        if loaded != self._loaded:
-            self._loaded = loaded
+        """Show points that did not change on this page, and the values in use."""
+        former, entries = self._stored, presenter.entries(self.session)
+        self._stored = self.session.path, fingerprint(entries)
+        is_same_session = former is not None and former[0] == self.session.path
+        # What could not be stored stays.
+        if self._stored != former and not (is_same_session and self._is_shown(entries)):
             self._clear()
-            if kept is not None:
-                self.take_kept()
+            if entries is not None:
+                self._take(entries)
         none = "The session keeps no picture yet: Apply keeps it"
-        offer(self.kept_button, none if kept is None else "")
+        offer(self.kept_button, none if self.session.plane_calibration is None else "")
         self.in_use.set_rows(presenter.in_use(self.session))
         self._follow()
 
     def load(self, path: Path) -> None:
         """Show a picture of the target and find O′ and the axes in it."""
+        session = self.session
 
-        def loaded(image: GreyImage) -> None:
-            self._name, self._tilted = path.name, ()
-            self._show(image, None)
+        def loaded(picture: KeptPicture) -> None:
+            self._show((picture,), None)
             self.find_axes()
 
-        self.start_latest("Loading the picture", path, lambda _: read_picture(path), loaded)
+        self.start_latest(
+            "Loading the picture", path, lambda _: load_picture(session, path), loaded
+        )
 
     def add_picture(self, path: Path) -> None:
         """Add a picture of the board in another pose."""
+        session = self.session
 
-        def loaded(image: GreyImage) -> None:
-            self._tilted = (*self._tilted, image)
+        def loaded(picture: KeptPicture) -> None:
+            self._pictures = (*self._pictures, picture)
             self.find_axes()
 
-        self.start_task("Loading the picture", lambda _: read_picture(path), loaded)
+        self.start_task("Loading the picture", lambda _: load_picture(session, path), loaded)
 
     def take_kept(self) -> None:
-        """Show the stored picture and the points in use."""
-        session, kept = self.session, self.session.plane_calibration
-        if kept is None:
-            return
+        """Show the picture and the points in use; those not applied are discarded."""
+        kept, waiting = self.session.plane_calibration, self.session.plane_entries
+        if waiting is not None and not self.locked:
+            self.workspace.attempt(lambda session: session.set_entries("plane", None))
+        elif kept is not None:
+            self._take(kept)
 
-        def shown(image: GreyImage) -> None:
-            if session.plane_calibration == kept:
-                is_board = isinstance(kept.found, BoardCalibration)
-                (self.square if is_board else self.unit).set_value(kept.unit_mm)
-                self._tilted = ()
-                self._show(image, kept.found)
+    def _take(self, stored: PlanePicture) -> None:
+        """Show stored points and their pictures."""
+        session, since = self.session, self._stored
+
+        def shown(pictures: tuple[KeptPicture, ...]) -> None:
+            if self._stored == since:
+                is_board = isinstance(stored.found, BoardCalibration)
+                (self.square if is_board else self.unit).set_value(stored.unit_mm)
+                self._show(pictures, stored.found)
 
         self.workspace.tasks.start(
             "Showing the calibration picture",
-            lambda _: session.picture(kept.picture_sha256),
+            lambda _: presenter.pictures(session, stored),
             shown,
         )
+
+    def entries(self) -> PlanePicture | None:
+        """What is shown, as a session stores it; None if that cannot be stored."""
+        if self.found is None or not self._pictures:
+            return None
+        return presenter.stored(self.found, self._applied_unit(), self._pictures)
+
+    def _store(self) -> None:
+        """Store the points until they are applied."""
+        entries = self.entries()
+        if entries is not None and not self.locked:
+            self.workspace.attempt(lambda session: presenter.enter(session, entries))
+
+    def _is_shown(self, entries: PlanePicture | None) -> bool:
+        return fingerprint(self.entries()) == fingerprint(entries)
+
+    def leave(self) -> None:
+        """Store a point that is being dragged."""
+        if not self._is_shown(presenter.entries(self.session)):
+            self._store()
 
     def find_axes(self) -> None:
         """Find O′ and the axes."""
         image = self.view.picture
         if image is None:
             return
-        unit, images, lens = self._unit(), (image, *self._tilted), lens_of(self.session.setup_text)
+        images = tuple(picture.image for picture in self._pictures)
+        unit, lens = self._unit(), lens_of(self.session.setup_text)
 
         def found(calibration: Calibration) -> None:
             if self.view.picture is image:
                 if isinstance(calibration, BoardCalibration):
                     self.square.set_value(calibration.board.square_mm)
                 self._place(presenter.with_unit(calibration, self._unit()))
+                self._store()
 
         self._finding = self.start_latest(
             "Looking for O′ and the axes",
@@ -144,13 +176,12 @@ class PlanePage(Page):
 
     def use(self) -> None:
         """Use the displayed calibration."""
-        image, found, unit = self.view.picture, self.found, self._unit()
-        if image is None or found is None:
+        found, unit = self.found, self._applied_unit()
+        if found is None or not self._pictures:
             return
-        if isinstance(found, BoardCalibration):
-            unit = found.board.square_mm
+        first = self._pictures[0]
         if self.workspace.attempt(
-            lambda session: session.use_plane(found, unit, image, self._name)
+            lambda session: session.use_plane(found, unit, first.image, first.name)
         ):
             words = "The calibration is in use; undo restores the former one"
             self.workspace.notified.emit(words, False)
@@ -272,21 +303,30 @@ class PlanePage(Page):
     def _unit(self) -> float:
         return self.unit.value() or presenter.UNIT_MM
 
+    def _applied_unit(self) -> float:
+        """Unit of the target, or square of the board, that is stored with the points, mm."""
+        found = self.found
+        return found.board.square_mm if isinstance(found, BoardCalibration) else self._unit()
+
     def _unit_changed(self) -> None:
         if self.found is not None:
             self._place(presenter.with_unit(self.found, self._unit()))
+            self._store()
 
     def _square_changed(self) -> None:
         square = self.square.value()
         if isinstance(self.found, BoardCalibration) and square is not None:
             self._place(self.found.with_square(square))
+            self._store()
 
     def _clear(self) -> None:
+        self._pictures = ()
         self.view.show_picture(None)
         self.lead_changed.emit()
         self._place(None)
 
-    def _show(self, image: GreyImage, found: Calibration | None) -> None:
+    def _show(self, pictures: tuple[KeptPicture, ...], found: Calibration | None) -> None:
+        self._pictures, image = pictures, pictures[0].image
         self.view.show_picture(image)
         self.lead_changed.emit()
         rows, columns = image.shape
@@ -300,6 +340,7 @@ class PlanePage(Page):
             for k, (name, place) in enumerate(zip(POINTS, presenter.places(found), strict=True)):
                 point = DragPoint(name, *place, COLOR)
                 point.moved.connect(lambda u, v, k=k: self.drag(k, u, v))
+                point.placed.connect(self._store)
                 self.points.append(point)
                 self.view.add_point(point)
         for k, point in enumerate(self.points):
@@ -320,6 +361,7 @@ class PlanePage(Page):
         """Use another model than the proposed one."""
         if isinstance(self.found, PlaneCalibration):
             self._place(replace(self.found, model=model))
+            self._store()
 
     def _show_residuals(self) -> None:
         """Redraw the residual map."""

@@ -22,8 +22,12 @@ from labapp.core.calibration.plane_calibration import (
 from labapp.core.geometry.coordinates import Lens
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, round_factor
+from labapp.gui.pages.kept_picture import KeptPicture
 from labapp.media import GreyImage
 from labapp.session.calibrations import calibrations_in_use
+from labapp.session.file.blobs import fingerprint
+from labapp.session.file.stored import LARGEST_PX
+from labapp.session.record import PlanePicture
 from labapp.session.session import Session
 from labapp.simulation.calibration.target import Target
 
@@ -33,8 +37,8 @@ POINTS = ("O′", "O′X′", "O′Z′")
 HAND_SIGMA_PX = 0.5
 """Standard uncertainty of a point placed by hand, px."""
 
-UNPLACED = float("inf")
-"""Standard uncertainty of a point not yet placed."""
+UNPLACED = LARGEST_PX
+"""Standard uncertainty of a point not yet placed: it may be anywhere."""
 
 UNIT_MM = Target().unit_mm
 
@@ -103,6 +107,35 @@ class PlaneResult:
     """Reason why they cannot be used; empty if they can."""
     warnings: tuple[str, ...] = ()
     """Warnings for the operator."""
+
+
+def entries(session: Session) -> PlanePicture | None:
+    """Points that are not applied yet; without any, those of the calibration in use."""
+    return session.plane_entries or session.plane_calibration
+
+
+def stored(
+    found: Calibration, unit_mm: float, pictures: Sequence[KeptPicture]
+) -> PlanePicture | None:
+    """A calibration as a session stores it; None if it is no calibration at present."""
+    try:
+        _ = found.image_calibration
+    except ValueError:  # its three points lie on one line
+        return None
+    first, *further = (picture.sha256 for picture in pictures)
+    return PlanePicture(unit_mm, found, first, tuple(further))
+
+
+def enter(session: Session, entered: PlanePicture) -> None:
+    """Store points until they are applied, unless they are in use."""
+    is_in_use = fingerprint(entered) == fingerprint(session.plane_calibration)
+    session.set_entries("plane", None if is_in_use else entered)
+
+
+def pictures(session: Session, found: PlanePicture) -> tuple[KeptPicture, ...]:
+    """The pictures of a stored calibration; raises `InputError` if one is damaged."""
+    keys = found.picture_sha256, *found.further_sha256
+    return tuple(KeptPicture("picture", session.picture(key), key) for key in keys)
 
 
 def result(found: Calibration | None) -> PlaneResult:
@@ -270,7 +303,8 @@ def size_warnings(session: Session, picture: GreyImage | None) -> tuple[str, ...
 def is_in_use(session: Session, found: Calibration | None) -> bool:
     """Whether the set-up contains this calibration."""
     kept = session.plane_calibration
-    return kept is not None and kept.found == found and calibrations_in_use(session)[1]
+    is_kept = kept is not None and fingerprint(kept.found) == fingerprint(found)
+    return is_kept and calibrations_in_use(session)[1]
 
 
 def in_use(session: Session) -> tuple[ResultRow, ...]:
