@@ -119,7 +119,7 @@ class Session(SessionContents):
         """
         self._documents.change("experiment record", {("record", NO_FRAME): record})
 
-    def set_setup(self, text: str, label: str = "setup") -> None:
+    def set_setup(self, text: str, label: str = "set-up") -> None:
         """Replace the set-up by the text of a setup file.
 
         Parameters
@@ -144,7 +144,7 @@ class Session(SessionContents):
         self._documents.change(label, {("setup", NO_FRAME): text})
 
     def update_setup(
-        self, values: Mapping[str, Mapping[str, object]], label: str = "setup"
+        self, values: Mapping[str, Mapping[str, object]], label: str = "set-up"
     ) -> None:
         """Set or delete (None) keys of the set-up: section → key → value; it may be incomplete.
 

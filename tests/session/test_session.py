@@ -542,7 +542,7 @@ def test_picture_without_a_target_changes_nothing(session: Session, tmp_path: Pa
     cv2.imwrite(str(tmp_path / "dark.png"), np.zeros((200, 200), np.uint8))
     with pytest.raises(CannotMeasure):
         session.calibrate_plane(tmp_path / "dark.png", 6.35)
-    assert [change.label for change in session.history] == ["experiment record", "setup"]
+    assert [change.label for change in session.history] == ["experiment record", "set-up"]
     assert session.plane_calibration is None
 
 

@@ -801,3 +801,33 @@ def test_detected_columns_are_those_of_the_plane_if_the_picture_is_mirrored(
     found = presenter.detect(np.zeros((8, 8)), 0, by, Control())
     assert found.correction(mirrored).lattice.column.tolist() == [2, 1]
     assert found.correction(None).lattice.column.tolist() == [1, 2]
+
+
+def test_numbering_leaves_out_only_dots_that_cannot_be_numbered(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    session = show(page, qtbot, copy_sample("blocked_rows"), 0)
+    before = page.editor.correction
+    assert before is not None
+    inside = np.flatnonzero(before.sited)[[60, 61, 90]]
+    page.editor.selection = inside
+    key(page, Qt.Key.Key_U)
+    u, v = before.dots.image_px[inside[:2]].mean(axis=0).tolist()  # between two dots of a row
+    page.add_at(u, v + 8)
+    steps = len(session.history)
+    page.choose(page.editor.choose_none)
+    odd = len(page.editor.dots_px) - 1
+    page.editor.selection = np.array([*inside, odd])
+    key(page, Qt.Key.Key_N)
+    after = page.editor.correction
+    assert after is not None
+    assert len(session.history) == steps + 1
+    np.testing.assert_array_equal(after.lattice.row[inside], before.lattice.row[inside])
+    np.testing.assert_array_equal(after.lattice.column[inside], before.lattice.column[inside])
+    assert not after.sited[odd]
+    assert page.editor.selection.tolist() == [odd]
+    assert page.dots_panel.chosen.text().startswith(PROBLEM)
+    u, v = after.dots.image_px[odd].tolist()
+    assert f"({u:.1f}, {v:.1f}) px" in page.dots_panel.chosen.text()
+    key(page, Qt.Key.Key_Period)
+    assert PROBLEM not in page.dots_panel.chosen.text()

@@ -92,7 +92,8 @@ def test_dots_are_numbered_by_their_neighbours() -> None:
     lost = np.array([8, 9, 20])
     row[lost] = column[lost] = 0
     bare = Correction.of(correction.dots, Lattice(row, column))
-    numbered = picking.numbered_by_neighbours(bare, lost)
+    numbered, unnumbered = picking.numbered_by_neighbours(bare, lost)
+    assert unnumbered == {}
     np.testing.assert_array_equal(numbered.lattice.row, correction.lattice.row)
     np.testing.assert_array_equal(numbered.lattice.column, correction.lattice.column)
     assert numbered.manual[lost].all()
@@ -108,3 +109,38 @@ def test_dot_between_sites_is_not_numbered() -> None:
     )
     with pytest.raises(ValueError, match="do not fix"):
         picking.numbered_by_neighbours(between, np.array([8]))
+
+
+def test_dots_are_numbered_although_one_of_them_cannot_be() -> None:
+    whole = grid()
+    u, lattice = whole.dots.u_px.copy(), whole.lattice
+    u[8] += 10  # between two sites
+    names = list(whole.dots.__dict__)[1:]
+    lost = np.array([8, 9, 20])
+    row, column = lattice.row.copy(), lattice.column.copy()
+    row[lost] = column[lost] = 0
+    bare = Correction.of(
+        Dots(u, *(getattr(whole.dots, name) for name in names)), Lattice(row, column)
+    )
+    numbered, unnumbered = picking.numbered_by_neighbours(bare, lost)
+    assert list(unnumbered) == [8]
+    assert unnumbered[8]
+    for now, known in (
+        (numbered.lattice.row, lattice.row),
+        (numbered.lattice.column, lattice.column),
+    ):
+        np.testing.assert_array_equal(now[[9, 20]], known[[9, 20]])
+        assert now[8] == 0
+
+
+def test_dot_is_numbered_once_its_neighbours_are() -> None:
+    whole = grid()
+    lattice = whole.lattice
+    lost = np.flatnonzero((lattice.column > 2) | (lattice.row > 2))[::-1]  # the farthest first
+    row, column = lattice.row.copy(), lattice.column.copy()
+    row[lost] = column[lost] = 0
+    numbered, unnumbered = picking.numbered_by_neighbours(
+        Correction.of(whole.dots, Lattice(row, column)), lost
+    )
+    assert unnumbered == {}
+    np.testing.assert_array_equal(numbered.lattice.column, lattice.column)

@@ -16,10 +16,14 @@ from labapp.core.rows.correction import Correction
 from labapp.core.rows.lattice import Site
 from labapp.core.values import FloatArray, IntArray
 from labapp.gui.pages.dots import picking
+from labapp.gui.tasks import PROBLEM
 from labapp.text import pluralize
 
 Commit = Callable[[str, Callable[[], Correction | None]], bool]
 """Makes an edit, one step of that name; reports an error and returns False if refused."""
+
+REASONS = 3
+"""Most dots that are not numbered whose reasons are named."""
 
 NOTHING: IntArray = np.zeros(0, np.int64)
 
@@ -129,7 +133,7 @@ class Editor:
             added = core.add_dot(correction, image, u, v, settings.dots.band_pass)
             own = np.array([len(added.dots) - 1])
             try:
-                return picking.numbered_by_neighbours(added, own)
+                return picking.numbered_by_neighbours(added, own)[0]
             except ValueError:
                 return added
 
@@ -160,10 +164,26 @@ class Editor:
         return self._edit(label, lambda c: core.assign(c, chosen, row, column))
 
     def number(self) -> bool:
-        """Set the row and column of the selected dots from their neighbours."""
-        chosen = self.selection
-        label = f"number {pluralize(len(chosen), 'dot')}"
-        return self._edit(label, lambda c: picking.numbered_by_neighbours(c, chosen))
+        """Set the row and column of the selected dots from their neighbours, where these do.
+
+        Those that could not be numbered stay selected, and `refusal` says why.
+        """
+        chosen, unnumbered = self.selection, dict[int, str]()
+
+        def edit(correction: Correction) -> Correction:
+            made, left = picking.numbered_by_neighbours(correction, chosen)
+            unnumbered.update(left)
+            return made
+
+        done = self._edit("number dots by their neighbours", edit)
+        if unnumbered:
+            self.selection = np.array(list(unnumbered), np.int64)
+            done_words = f"{len(chosen) - len(unnumbered)} of {len(chosen)} dots are numbered"
+            reasons = list(unnumbered.values())
+            more = len(reasons) - REASONS
+            parts = [*reasons[:REASONS], *([f"{more} more for such reasons"] if more > 0 else [])]
+            self.refusal = f"{PROBLEM} {done_words}. In doubt: {'; '.join(parts)}"
+        return done
 
     def put_in_doubt(self) -> bool:
         """Mark the selected dots as doubtful: without row and column."""

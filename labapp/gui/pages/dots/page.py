@@ -393,7 +393,7 @@ class DotsPage(Page):
             Command("Delete", "Del", "Delete the selected dots", lambda: self._then(editor.delete),
                     "dots"),
             Command("Number", "N", "Number the selected dots by their neighbours",
-                    editor.number, "dots"),
+                    lambda: self._then(editor.number), "dots"),
             Command("Row left", "Ctrl+Left", "Shift the selected rows left by a column",
                     lambda: editor.shift(-1), "row"),
             Command("Row right", "Ctrl+Right", "Shift the selected rows right by a column",

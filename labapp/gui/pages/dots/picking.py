@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from labapp.core.rows.correction import Correction, assign, clear_rows
 from labapp.core.rows.lattice import Site
@@ -112,21 +113,41 @@ def site_px(correction: Correction, site: Site) -> FloatArray | None:
     return np.asarray(np.linalg.lstsq(terms, places[sited[near]], rcond=None)[0][0])
 
 
-def numbered_by_neighbours(correction: Correction, dots: IntArray) -> Correction:
+def numbered_by_neighbours(
+    correction: Correction, dots: IntArray
+) -> tuple[Correction, dict[int, str]]:
     """Set the row and column of dots from the dots around them.
+
+    Returns
+    -------
+    tuple
+        The correction, and for each of the dots that has no number now, the reason: it lies between
+        sites, too few dots near it are numbered, or another dot has its site.
 
     Raises
     ------
     ValueError
-        If there are no numbered dots, a dot lies between sites, or another dot has its site.
+        If no dot can be numbered.
     """
-    correction = clear_rows(correction, dots)
-    for dot in dots.tolist():
-        u, v = correction.dots.image_px[dot].tolist()
-        found = site_at(correction, u, v)
-        if found is None or found[1] > FAR_OFF:
-            raise ValueError(
-                f"the dots near ({u:.1f}, {v:.1f}) px do not fix its row and column; type them"
-            )
-        correction = assign(correction, [dot], *found[0])
-    return correction
+    made, unnumbered = clear_rows(correction, dots), dict[int, str]()
+    # Those beside numbered dots come first: they are the neighbours of those farther off.
+    places = correction.dots.image_px
+    away = cdist(places[dots], places[made.sited]).min(axis=1, initial=np.inf)
+    for dot in dots[np.argsort(away, kind="stable")].tolist():
+        try:
+            made = _numbered(made, dot)
+        except ValueError as error:
+            unnumbered[dot] = str(error)
+    if len(unnumbered) == len(dots):
+        raise ValueError(*list(unnumbered.values())[:1])
+    return made, unnumbered
+
+
+def _numbered(correction: Correction, dot: int) -> Correction:
+    u, v = correction.dots.image_px[dot].tolist()
+    found = site_at(correction, u, v)
+    if found is None or found[1] > FAR_OFF:
+        raise ValueError(
+            f"the dots near ({u:.1f}, {v:.1f}) px do not fix its row and column; type them"
+        )
+    return assign(correction, [dot], *found[0])
