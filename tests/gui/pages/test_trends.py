@@ -12,7 +12,7 @@ from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages.trends.page import TrendsPage
-from labapp.gui.pages.trends.presenter import CORRECTED, STALE, TrendOptions, show
+from labapp.gui.pages.trends.presenter import CORRECTED, SIGNALS, STALE, TrendOptions, show
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.session.signals import Signals
@@ -184,6 +184,8 @@ def test_table_is_loaded_stored_shifted_and_undone(
     table.write_text("time_s,current_a\n0,75\n0.2,80\n0.4,70\n")
     page.read_signals(table)
     qtbot.waitUntil(lambda: len(page.plots.curves) == 5)
+    offered = {key for key in SIGNALS if page._boxes[key].isVisibleTo(page.panel)}
+    assert offered == {"current"}  # the table has no other channel
     page.start.edited.emit(0.1)
     session = page.workspace.session
     assert session is not None

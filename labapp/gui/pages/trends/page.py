@@ -130,8 +130,9 @@ class TrendsPage(Page):
         for widget in (self.start, self.start.label):
             widget.setVisible(signals is not None)
         self.start.set_value(None if signals is None else signals.start_s)
+        channels = {} if signals is None else signals.channels
         for key in SIGNALS:
-            self._boxes[key].setVisible(signals is not None)
+            self._boxes[key].setVisible(key in channels)
 
     # --- what the operator does ---------------------------------------------------------------
 
