@@ -17,6 +17,10 @@ from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
 from labapp.simulation.calibration.target import Target, TargetLook, render_target
 from labapp.simulation.camera import Lens
+from labapp.simulation.forward import trace
+from labapp.simulation.pools import spherical_cap
+from labapp.simulation.render import Look, render
+from tests.core.test_bench_check import EXACT, VIEW
 from tests.inked_board import InkedBoard
 from tests.posed_view import PosedView
 
@@ -240,6 +244,18 @@ def test_content_of_the_picture_is_recognised():
         calibration = calibrate_imaging_plane([shot(board, px_per_mm=scale)[1]], target.unit_mm)
         assert isinstance(calibration, BoardCalibration)
         assert calibration.board == board
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_laser_dots_are_no_chessboard(seed: int):
+    reflections = trace(spherical_cap(6.5, 0.3), EXACT.rig)
+    frame = render(reflections, VIEW, Look(), np.random.default_rng(seed))
+    with pytest.raises(CannotMeasure) as error:
+        calibrate_imaging_plane([frame.image])
+    assert error.value.status == "no-target"
+    with pytest.raises(CannotMeasure) as error:
+        calibrate_board([frame.image])
+    assert error.value.status == "no-board"
 
 
 def test_known_lens_straightens_the_target():

@@ -36,6 +36,9 @@ MARGIN = 0.15
 REACH = 0.19
 """Radius of the window about a corner, as a share of a square's edge: a marker begins at 0.21."""
 
+LEAST_REAL = 0.6
+"""Least share of the corners of a chessboard that look like corners."""
+
 SMALLEST_PX = 12.0
 """Smallest square whose corners are found, px."""
 
@@ -201,10 +204,9 @@ def find_board(image: ColourOrGrey, board: Board | None = None) -> BoardCorners:
         levels = grey_levels(image)
     except CannotMeasure as too_small:
         raise CannotMeasure("no-board", too_small.reason) from None
-    grey = _stretched(levels)
     if board is None:
-        board = _recognised(grey)
-    found = _charuco(grey, board) if board.kind == "charuco" else _chessboard(grey, board)
+        board = _recognised(levels)
+    found = (_charuco if board.kind == "charuco" else _chessboard)(levels, board)
     found = _refined(levels, found)
     lines = [np.unique(found.plane_mm[:, axis]).size for axis in (0, 1)]
     if len(found.index) < FEWEST_CORNERS or min(lines) < FEWEST_LINES:
@@ -222,13 +224,13 @@ def is_charuco(image: ColourOrGrey) -> bool:
     return any(_share(board, ids) for board in BOARDS.values())
 
 
-def _recognised(grey: npt.NDArray[np.uint8]) -> Board:
+def _recognised(levels: FloatArray) -> Board:
     """The board of `BOARDS` that a picture shows."""
-    ids = _markers(grey, "4X4_250")
+    ids = _markers(_stretched(levels), "4X4_250")
     shown = [board for board in BOARDS.values() if _share(board, ids)]
     if shown:
         return max(shown, key=lambda board: _share(board, ids))
-    size = _chessboard_size(grey)
+    size = _chessboard_size(levels)
     for board in BOARDS.values():
         if board.kind == "chessboard" and size == (board.columns - 1, board.rows - 1):
             # Boards with the same number of squares differ only in size, which the user supplies.
@@ -251,8 +253,8 @@ def _share(board: Board, ids: IntArray) -> int:
     return own if own >= FEWEST_MARKERS else 0
 
 
-def _charuco(grey: npt.NDArray[np.uint8], board: Board) -> BoardCorners:
-    size = (board.columns, board.rows)
+def _charuco(levels: FloatArray, board: Board) -> BoardCorners:
+    grey, size = _stretched(levels), (board.columns, board.rows)
     dictionary, ids = _dictionary(board.dictionary), np.array(board.ids, np.int32)
     design = cv2.aruco.CharucoBoard(size, 1.0, 1.0 - 2.0 * MARGIN, dictionary, ids)
     parameters = cv2.aruco.CharucoParameters()
@@ -286,40 +288,43 @@ def _no_charuco(grey: npt.NDArray[np.uint8], board: Board, seen: Any) -> CannotM
 
 def _refined(grey: FloatArray, found: BoardCorners) -> BoardCorners:
     """Refine the corners on the grey levels; drop those that do not look like a corner."""
-    pitch = _pitch_px(found)
+    pitch = _pitch_px(found.image_px)
     if pitch < SMALLEST_PX:
         raise CannotMeasure(
             "no-board",
             f"The squares of {found.board.name} are {pitch:.0f} px wide, which is too small: "
             f"{SMALLEST_PX:.0f} px are needed. Move the camera nearer or use a larger board.",
         )
-    radius = float(np.clip(REACH * pitch, 3.0, 12.0))
-    places = [fit_corner(grey, place, radius) for place in found.image_px]
+    places = _fitted(grey, found.image_px)
     seen = [k for k, place in enumerate(places) if place is not None]
     image_px = np.array([places[k] for k in seen], float).reshape(-1, 2)
     return BoardCorners(found.board, found.index[seen], image_px)
 
 
-def _pitch_px(found: BoardCorners) -> float:
+def _fitted(grey: FloatArray, image_px: FloatArray) -> list[FloatArray | None]:
+    """Position of each corner in the grey levels, shape (2,), px; None where there is none."""
+    radius = float(np.clip(REACH * _pitch_px(image_px), 3.0, 12.0))
+    return [fit_corner(grey, place, radius) for place in image_px]
+
+
+def _pitch_px(image_px: FloatArray) -> float:
     """Median distance of neighbouring corners in the picture, px; infinite if there are none."""
-    nearest = [
-        np.sort(np.hypot(*(found.image_px - place).T))[1:2] for place in found.image_px.tolist()
-    ]
+    nearest = [np.sort(np.hypot(*(image_px - place).T))[1:2] for place in image_px.tolist()]
     apart = np.concatenate([*nearest, np.empty(0)])
     return float(np.median(apart)) if len(apart) else float("inf")
 
 
-def _chessboard(grey: npt.NDArray[np.uint8], board: Board) -> BoardCorners:
+def _chessboard(levels: FloatArray, board: Board) -> BoardCorners:
     size = (board.columns - 1, board.rows - 1)
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    seen = _chessboard_size(grey)
+    seen = _chessboard_size(levels)
     if seen is not None and sorted(seen) != sorted(size):
         raise CannotMeasure(
             "wrong-board",
             f"{seen[0]} × {seen[1]} inner corners are seen where {board.name} has {size[0]} × "
             f"{size[1]}: part of it is hidden or out of the picture, or it is another board.",
         )
-    done, corners = cv2.findChessboardCornersSB(grey, size, flags=flags)
+    done, corners = cv2.findChessboardCornersSB(_stretched(levels), size, flags=flags)
     if not done:
         raise CannotMeasure(
             "no-board",
@@ -335,11 +340,15 @@ def _chessboard(grey: npt.NDArray[np.uint8], board: Board) -> BoardCorners:
     return BoardCorners(board, np.arange(grid.shape[0] * grid.shape[1]), grid.reshape(-1, 2))
 
 
-def _chessboard_size(grey: npt.NDArray[np.uint8]) -> tuple[int, int] | None:
+def _chessboard_size(levels: FloatArray) -> tuple[int, int] | None:
     """Number of inner corners along a row and a column of the chessboard; None if there is none."""
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
-    done, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+    done, corners, meta = cv2.findChessboardCornersSBWithMeta(_stretched(levels), (3, 3), flags)
     if not done:
+        return None
+    # OpenCV also takes the dots of the laser pattern for corners.
+    places = _fitted(levels, np.asarray(corners, np.float64).reshape(-1, 2))
+    if sum(place is not None for place in places) < LEAST_REAL * len(places):
         return None
     rows, columns = np.asarray(meta).shape[:2]
     grid = np.asarray(corners, np.float64).reshape(rows, columns, 2)
