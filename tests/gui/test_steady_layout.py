@@ -20,6 +20,7 @@ from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages.dots.page import DotsPage
 from labapp.gui.pages.setup.page import BENCH_TAB, SAFETY_TAB
+from labapp.gui.pages.surface.page import SurfacePage
 from labapp.gui.shell.step_list import SidePanel
 from labapp.gui.shell.steps import STEPS
 from labapp.gui.shell.window import MainWindow
@@ -213,6 +214,25 @@ def test_primary_buttons_are_visible_on_a_small_screen(
         if each.text().replace("&", "") == words and each.isVisible()
     ]
     assert [each.visibleRegion().boundingRect() for each in buttons] == [buttons[0].rect()]
+
+
+def test_surface_and_its_sizes_are_visible_on_a_small_screen(
+    opened: MainWindow, qtbot: QtBot
+) -> None:
+    """As on a screen of 1366 × 768 px at 150 %: nothing has to be scrolled for the height."""
+    opened.resize(911, 512)
+    opened.show_step("surface")
+    page = opened.page
+    assert isinstance(page, SurfacePage)
+    qtbot.waitUntil(lambda: page.side.sizes.rowCount() > 0 and not opened.workspace.tasks.active)
+    let_draw()
+    sizes = page.side.sizes
+    (height,) = (k for k in range(sizes.rowCount()) if sizes.item(k, 0).text() == "Height")
+    row = sizes.visualItemRect(sizes.item(height, 0))
+    assert sizes.viewport().visibleRegion().contains(row.center())
+    assert page.view.height() > page.height() / 2
+    lines = {each.mapTo(page, QPoint(0, 0)).y() for each in (page.colour, page.save, page.film)}
+    assert len(lines) <= 2
 
 
 def test_selected_dot_scrolls_its_buttons_into_view(opened: MainWindow, qtbot: QtBot) -> None:

@@ -21,6 +21,7 @@ from PySide6.QtGui import (
 from PySide6.QtWidgets import (
     QHBoxLayout,
     QMenu,
+    QSizePolicy,
     QSplitter,
     QStackedWidget,
     QStyleOptionToolButton,
@@ -77,17 +78,14 @@ SCREEN_DPI = 96.0
 
 NOT_OF_LINES = "Only of patterns of dots: this session is of lines"
 
-GAP_PX = 6
-"""Gap between groups of tools, and between their lines."""
+GAP_PX, TOOL_GAP_PX = 6, 2
+"""Gap between groups of tools, and between their lines; gap between the tools of a group."""
 
 DOTS_TAB = 2
 """Tab of the reflected dots on a narrow canvas."""
 
-ANSWER_PX = 80
-"""Minimum space for the message beside the save buttons."""
-
-NARROW_FIELD = 84
-"""Width of a field for two digits, so that all tools fit in one line on a small screen."""
+NARROW_FIELD = 72
+"""Width of a field for two digits, so that the tools fit in one or two lines on a small screen."""
 
 SHOWN_PARTS = {
     "points": ("Reflection &points", "White dots: where the rays meet the surface"),
@@ -230,7 +228,8 @@ class SurfacePage(Page):
         self.comparing = tool_button("Compare", tip, self._toggle_compare, _Toggle())
         self.comparing.setCheckable(True)
         self.saved = Message(1)
-        self.saved.setMinimumWidth(ANSWER_PX)
+        # It has what the buttons leave; where that is nothing, the last line has its text, too.
+        self.saved.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
         self._view_actions()
         coloured = self.colour.label, self.colour
         return _Tools(
@@ -455,6 +454,7 @@ class _Tools(QWidget):
         self._groups = [QWidget(self) for _ in groups]
         for widget, group in zip(self._groups, groups, strict=True):
             widget.setLayout(group)
+            group.setSpacing(TOOL_GAP_PX)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)

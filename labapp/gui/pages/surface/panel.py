@@ -24,10 +24,13 @@ from labapp.gui.widgets.labels import (
     show_words,
     wrapping_label,
 )
-from labapp.gui.widgets.layouts import column_of, fill
+from labapp.gui.widgets.layouts import fill, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.results.measured import scheme_name
+
+LABEL_GAP_PX = 3
+"""Gap between a label and the field below it."""
 
 SIGNS = {"measured": "✓", "stale": "⟳", "failed": "✗", "unmeasured": "○"}
 """Signs for the state of a frame."""
@@ -50,13 +53,14 @@ class SurfacePanel:
         self.correspondence.edited.connect(self._choose_correspondence)
         fields = (self.scheme, self.correspondence)
         # Labels above: beside them, a small window would cut the texts of the choices off.
-        form = column_of(*(part for field in fields for part in (field.label, field)))
+        form = vbox(*(part for field in fields for part in (field.label, field)))
+        form.setSpacing(LABEL_GAP_PX)
         self.status, self.setup_words = wrapping_label(), wrapping_label()
         self.provenance, self.verdict = wrapping_label(), wrapping_label()
         self._stale = False
         self.status.setAccessibleName("How this frame stands")
         self.again = button(
-            "Measure &again", "Measure this frame again: its figures are out of date", self.this_one
+            "&Again", "Measure this frame again: its figures are out of date", self.this_one
         )
         self.sizes = ResultTable("Size of the pool")
         self.errors = ResultTable("Reflection errors")
@@ -64,11 +68,11 @@ class SurfacePanel:
         grid = self._measuring()
         measuring = (self.one, self.missing, self.all, self.again)
         self._tips = {each: each.toolTip() for each in measuring}
-        keep_room(self.progress, self.cancel, self.again)
+        keep_room(self.progress, self.cancel, self.again, answer)
         fill(
             layout,
-            *(form, grid, answer, self.status, self.setup_words),
-            *(self.sizes, self.errors, self.provenance, self.verdict, self.trials, 1),
+            *(form, grid, self.status, self.sizes, self.setup_words),
+            *(self.errors, self.provenance, self.verdict, self.trials, 1),
         )
         workspace.tasks.changed.connect(self._show_progress)
         workspace.tasks.progressed.connect(self._show_progress)
@@ -87,12 +91,14 @@ class SurfacePanel:
         self.cancel = button("&Cancel", "Stop measuring; what is done stays (Ctrl+.)", self.stop)
         grid = QGridLayout()
         grid.addWidget(heading("Measure"), 0, 0)
-        grid.addWidget(self.one, 0, 1)
-        grid.addWidget(self.missing, 1, 0)
-        grid.addWidget(self.all, 1, 1)
-        grid.addWidget(self.progress, 2, 0)
-        grid.addWidget(self.again, 2, 0)  # in the same place: enabled while nothing is measured
-        grid.addWidget(self.cancel, 2, 1)
+        for column, each in enumerate((self.one, self.missing, self.all)):
+            grid.addWidget(each, 1, column)
+        # In the same places, so that the sizes are in view on a small screen: the answer comes when
+        # there is no progress any more, and nothing is out of date while frames are measured.
+        grid.addWidget(self._answer, 2, 0, 1, 2)
+        grid.addWidget(self.progress, 2, 0, 1, 2)
+        grid.addWidget(self.again, 2, 2)
+        grid.addWidget(self.cancel, 2, 2)
         return grid
 
     # --- what is shown -----------------------------------------------------------------------
@@ -134,6 +140,7 @@ class SurfacePanel:
             offer(each, f"{tip}. {why}" if why else "")
         self.progress.setVisible(task is not None)
         self.cancel.setVisible(task is not None)
+        self._answer.setVisible(task is None)
         self.again.setVisible(self._stale and task is None)
         if task is not None:
             self.progress.setRange(0, task.total)
