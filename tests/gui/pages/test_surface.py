@@ -4,6 +4,7 @@ import re
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -17,6 +18,7 @@ from PySide6.QtWidgets import (
     QAbstractButton,
     QApplication,
     QFileDialog,
+    QLabel,
     QScrollArea,
     QSplitter,
     QStyle,
@@ -35,6 +37,7 @@ from labapp.gui.shell.window import MainWindow
 from labapp.gui.views.picture_files import PaperDialog, write_plot
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
+from labapp.text import SETUP_MARKS
 from tests.gui.conftest import KEPT, CopySample, let_draw
 from tests.waiting import PATIENCE_S
 
@@ -392,6 +395,16 @@ def test_every_control_has_a_name_and_can_be_focused(page: SurfacePage) -> None:
             for part in (QAccessible.Text.Name, QAccessible.Text.Description):
                 assert interface.text(part), each.text()
             assert each.focusPolicy() & Qt.FocusPolicy.TabFocus, each.text()
+
+
+def test_doubt_of_the_setup_is_shown_above_the_sizes(page: SurfacePage) -> None:
+    doubt = f"{SETUP_MARKS['doubtful']} The set-up is doubtful."
+    page.side.show(replace(page.surface_state, setup_words=doubt))
+    let_draw()
+    labels = [each for each in page.panel.findChildren(QLabel) if doubt in each.text()]
+    assert len(labels) == 1
+    assert labels[0].isVisibleTo(page.panel)
+    assert labels[0].y() < page.side.sizes.y()
 
 
 def test_panel_fits_300_px(page: SurfacePage) -> None:

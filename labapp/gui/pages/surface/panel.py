@@ -28,6 +28,7 @@ from labapp.gui.widgets.layouts import fill, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.results.measured import scheme_name
+from labapp.text import SETUP_MARKS
 
 LABEL_GAP_PX = 3
 """Gap between a label and the field below it."""
@@ -116,9 +117,13 @@ class SurfacePanel:
                 widget.setVisible(not session.has_lines)
         dots = surface_state.state == "failed" and not session.has_lines
         remedy = " Its dots can be corrected in step Dots." if dots else ""
-        self.status.setText(f"{SIGNS[surface_state.state]} {surface_state.words}{remedy}")
+        status = f"{SIGNS[surface_state.state]} {surface_state.words}{remedy}"
+        about_setup = surface_state.setup_words
+        if about_setup.startswith(SETUP_MARKS["doubtful"]):  # a doubt must not need scrolling
+            status, about_setup = f"{status}\n{about_setup}", ""
+        self.status.setText(status)
         self._stale = surface_state.state == "stale"
-        show_words(self.setup_words, surface_state.setup_words)
+        show_words(self.setup_words, about_setup)
         show_words(self.provenance, surface_state.provenance)
         show_words(self.verdict, surface_state.verdict)
         for table, rows in (
