@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from labapp.core.matching.checks.hidden_rows import lines_before, rays_beside_hidden_rows
+from labapp.core.matching.checks.rim_left_out import refuse_rim_left_out
 from labapp.core.matching.checks.unexplained import (
     MOST_SCATTERED,
     any_explains,
@@ -136,10 +137,14 @@ def decide(
     sigma = best.pool.height_sigma_mm(known.landing_mm)
     refuse_contradicted(replace(known, height_sigma_mm=sigma), best.pool)
     freed = holes_left_open(observed, best, fit_settings, settings.margin)
+    with_rim = best.labels
     if freed:
         best = _without(observed, best, unconfirmed(freed[0], best.labels), fit_settings)
     open_holes = freed if len(freed) > 1 else []
-    return best, with_rivals(observed, open_holes, best.labels, rivals)
+    open_holes = with_rivals(observed, open_holes, best.labels, rivals)
+    if not open_holes:
+        refuse_rim_left_out(observed, with_rim)
+    return best, open_holes
 
 
 def _refuse_marker(observed: Observation, best: Hypothesis, found: list[Hypothesis]) -> None:

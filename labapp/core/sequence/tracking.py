@@ -18,6 +18,7 @@ import numpy as np
 
 from labapp.core.images import band_pass_kernels
 from labapp.core.match import Trial, missing_share
+from labapp.core.matching.checks.rim_left_out import refuse_rim_left_out
 from labapp.core.matching.checks.unexplained import is_scattered, refuse_contradicted
 from labapp.core.matching.checks.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.label_growth import OUTLIER_SPACINGS, OUTLIER_TIMES
@@ -130,6 +131,7 @@ def track(
     if not pool.residual_rms_mm < WORSE * prior.cold_residual_mm:
         raise TrackLost("the surface no longer explains the dots")
     refuse_contradicted(known_rays, pool)
+    refuse_rim_left_out(observed, fit.labels)
     paths = fit.paths()
     is_seen = _reference_is_seen(observed, paths, off)
     if not is_seen and prior.unseen >= HELD:

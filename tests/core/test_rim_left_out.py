@@ -1,0 +1,68 @@
+"""A rim whose dots have no ray, because the pool is steeper there than its middle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core.geometry.bench import Bench
+from labapp.core.matching.checks.rim_left_out import refuse_rim_left_out
+from labapp.core.matching.observation import UNLABELLED, Observation, neighbours_of
+from labapp.core.values import CannotMeasure, IntArray
+from labapp.simulation.pools import Footprint, Pool, egg
+from tests.benchmarks.dips import measure_pool
+from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, see, true_labels
+
+SMOOTH = egg(5.4, 2.6, 3.0, 0.27)
+BENCH = Bench(BENCH_RIG, BENCH_VIEW)
+
+
+def frame(false: int = 0) -> tuple[Observation, IntArray]:
+    """Return the dots of a smooth pool, some false, and the true labels."""
+    seen = see(SMOOTH, np.random.default_rng(3), sigma_px=0.05, false=false)
+    return Observation.of(seen.dots, BENCH, FRAME_SHAPE), true_labels(seen)
+
+
+def without_ends(labels: IntArray, rows: int) -> IntArray:
+    """Return labels without the first and the last dot of some rows, from the middle one on."""
+    fewer = labels.copy()
+    lit = np.flatnonzero((labels != UNLABELLED).sum(axis=1) > 4)
+    for i in lit[len(lit) // 2 :][:rows]:
+        ends = np.flatnonzero(labels[i] != UNLABELLED)[[0, -1]]
+        fewer[i, ends] = UNLABELLED
+    return fewer
+
+
+@pytest.mark.parametrize(
+    ("width", "peak", "fullness"), [(6.0, 0.28, 0.8), (5.4, 0.2, 0.85), (5.4, 0.2, 0.93)]
+)
+def test_pool_with_steep_sides_is_not_measured_too_low(
+    width: float, peak: float, fullness: float
+) -> None:
+    pool = Pool(Footprint(width, 0.55 * width, 0.6 * width), peak, fullness=fullness)
+    result = measure_pool(pool, see(pool, np.random.default_rng(1), sigma_px=0.05))
+    assert result.status != "ok" or abs(result.height) < 0.05
+
+
+def test_dots_left_out_all_round_are_refused() -> None:
+    observed, labels = frame()
+    with pytest.raises(CannotMeasure) as refusal:
+        refuse_rim_left_out(observed, without_ends(labels, rows=4))
+    assert refusal.value.status == "no-match"
+
+
+def test_few_dots_left_out_are_accepted() -> None:
+    observed, labels = frame()
+    refuse_rim_left_out(observed, without_ends(labels, rows=1))
+
+
+def test_false_dots_anywhere_are_accepted() -> None:
+    observed, labels = frame(false=12)
+    refuse_rim_left_out(observed, labels)
+
+
+def test_dots_left_out_within_the_others_are_accepted() -> None:
+    observed, labels = frame()
+    inner = np.argwhere(neighbours_of(labels != UNLABELLED) == 8)[:8]
+    labels[tuple(inner.T)] = UNLABELLED
+    refuse_rim_left_out(observed, labels)
