@@ -197,3 +197,28 @@ def test_rows_are_ambiguous_if_the_marker_between_dark_rays_has_no_place(
     with pytest.raises(CannotMeasure) as caught:
         decision._refuse_hidden_marker(observed, found)
     assert caught.value.status == "ambiguous-rows"
+
+
+def without_middle(rows: int) -> Hypothesis:
+    """Return the hypothesis of the true labels but those of five columns and some rows."""
+    seen = seen_with(false=0)
+    labels = true_labels(seen)
+    top, left = np.argwhere(labels != UNLABELLED).min(axis=0)
+    labels[top + 2 : top + 2 + rows, left + 1 : left + 6] = UNLABELLED
+    return hypothesis(seen, labels)[1]
+
+
+def test_missed_rays_of_removed_labels_are_accepted_only_if_few() -> None:
+    unexplained.refuse_much_in_doubt(without_middle(rows=2))
+    with pytest.raises(CannotMeasure) as caught:
+        unexplained.refuse_much_in_doubt(without_middle(rows=4))
+    assert caught.value.status == "no-match"
+
+
+def test_surface_with_many_labels_removed_as_doubtful_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(decision, "supported", lambda *_: without_middle(rows=4))
+    with pytest.raises(CannotMeasure) as caught:
+        matched(seen_with(false=0))
+    assert caught.value.status == "no-match"

@@ -13,6 +13,7 @@ from labapp.core.matching.checks.unexplained import (
     MOST_SCATTERED,
     any_explains,
     refuse_contradicted,
+    refuse_much_in_doubt,
     refuse_unexplained,
 )
 from labapp.core.matching.checks.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
@@ -129,6 +130,7 @@ def decide(
             rivals.append((other.labels, _excess(other, cheapest)))
     best = supported(observed, _without(observed, best, doubtful, fit_settings), fit_settings)
     best = _with_unknown(observed, best, ended.labels, fit_settings)
+    refuse_much_in_doubt(best)
     _refuse_hidden_marker(observed, best)
     best = _without_rays(
         observed, best, rays_beside_hidden_rows(observed, best, fit_settings), fit_settings

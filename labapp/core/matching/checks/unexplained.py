@@ -67,6 +67,11 @@ MOST_MISSED_APART = 0.12
 """Largest share of isolated missed rays, relative to the labelled dots, with which a hypothesis
 explains a frame."""
 
+MOST_IN_DOUBT = 0.2
+"""Largest share of missed rays, relative to the labelled dots, after doubtful labels are removed.
+In 400 frames of pools of all kinds, measured correctly, it was at most 0.12; with a steep hump it
+was 0.27, and the height was off by 5 σ."""
+
 
 def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
     """Whether there are few stray dots, few and isolated missed rays, and no dot at the marker."""
@@ -122,6 +127,16 @@ def refuse_unexplained(
         )
     if best.pool.level.ray_count and best.pool.level.disagreement_bits > CONTRADICTED_BITS:
         raise CannotMeasure("no-match", NO_BOUNDARY)
+
+
+def refuse_much_in_doubt(best: Hypothesis) -> None:
+    """Raise ``no-match`` if so many labels were removed that the surface is not well known."""
+    if best.missed_count > MOST_IN_DOUBT * best.label_count:
+        raise CannotMeasure(
+            "no-match",
+            f"the best surface supports the rays of {best.label_count} dots only, and "
+            f"{best.missed_count} rays between them have no dot",
+        )
 
 
 def is_scattered(
