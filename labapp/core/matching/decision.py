@@ -130,6 +130,7 @@ def decide(
             rivals.append((other.labels, _excess(other, cheapest)))
     best = supported(observed, _without(observed, best, doubtful, fit_settings), fit_settings)
     best = _with_unknown(observed, best, ended.labels, fit_settings)
+    with_rim = best.labels
     refuse_much_in_doubt(best)
     _refuse_hidden_marker(observed, best)
     best = _without_rays(
@@ -139,7 +140,6 @@ def decide(
     sigma = best.pool.height_sigma_mm(known.landing_mm)
     refuse_contradicted(replace(known, height_sigma_mm=sigma), best.pool)
     freed = holes_left_open(observed, best, fit_settings, settings.margin)
-    with_rim = best.labels
     if freed:
         best = _without(observed, best, unconfirmed(freed[0], best.labels), fit_settings)
     open_holes = freed if len(freed) > 1 else []

@@ -17,19 +17,20 @@ from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
-MOST_FREED = 8
-"""If at most this number of dots are beyond a hidden row, they lose their rays; otherwise the frame
-is refused."""
+FEW, MOST_FREED = 4, 8
+"""If at most the second number of dots are beyond a hidden row, they lose their rays; otherwise the
+frame is refused. The first, or fewer, tell little of it."""
 
-WIDE_GAP, WIDE_GAP_FEW = 1.45, 1.2
+WIDE_GAP, WIDE_GAP_FREED = 1.45, 1.35
 """A row may be hidden in a gap that exceeds by this factor what follows from the two gaps before
-it, whose ratio changes little on a smooth surface; the second, if few dots are beyond it."""
+it, whose ratio changes little on a smooth surface; the second, if at most `MOST_FREED` dots are
+beyond it."""
 
-AHEAD, AHEAD_FEW = 11.0, 25.0
-"""Labels must cost less by the first than with a hidden row, whose dots do not count as missed, or
-by the last if few dots are beyond the gap; in units of χ². Of labels one row off, nine in ten led
-by less than the first, or cost more; of right labels, those of 7 in 1,000 pools with a dip, and of
-2 in 84 of all kinds."""
+AHEAD, AHEAD_FREED, AHEAD_FEW = 11.0, 15.0, 25.0
+"""Labels must cost less by the first than with a hidden row, whose dots do not count as missed, by
+the second if at most `MOST_FREED` dots are beyond the gap, or by the last if at most `FEW`; in
+units of χ². Of labels one row off, nine in ten led by less than the first, or cost more, and one
+led by 13; of right labels, those of 7 in 1,000 pools with a dip, and of 2 in 84 of all kinds."""
 
 
 def rays_beside_hidden_rows(
@@ -51,8 +52,9 @@ def rays_beside_hidden_rows(
         own = evaluate_averaged(observed, best.labels, fit_settings, best.pool)
         if labels is None or own is None:
             continue
-        few = np.count_nonzero(labels != best.labels) <= 2 * MOST_FREED
-        if not few and width < WIDE_GAP:
+        moved = np.count_nonzero((labels != best.labels) & (labels != UNLABELLED))
+        freed = moved <= MOST_FREED
+        if not freed and width < WIDE_GAP:
             continue
         # Dots farther out may have a ray then.
         grown = grow_labels(observed, labels) if best.stray_count else None
@@ -60,9 +62,10 @@ def rays_beside_hidden_rows(
         cost = min(
             _cost_if_hidden(observed, each, best, axis, outer, fit_settings) for each in rivals
         )
-        if cost >= own.cost + (AHEAD_FEW if few else AHEAD):
+        ahead = AHEAD_FEW if moved <= FEW else AHEAD_FREED if freed else AHEAD
+        if cost >= own.cost + ahead:
             continue
-        if not few:
+        if not freed:
             line = "row" if axis == 0 else "column"
             raise CannotMeasure(
                 "ambiguous-rows",
@@ -134,7 +137,7 @@ def _wide_gaps(observed: Observation, labels: IntArray) -> Iterator[tuple[int, i
                 before = along[k - 1]
                 far = along[k - 2] if k > 1 and np.isfinite(along[k - 2]) else before
                 width = float(along[k] * far / before**2)
-                if width > WIDE_GAP_FEW:
+                if width > WIDE_GAP_FREED:
                     inner = k if step > 0 else len(gaps) - k
                     yield axis, inner, inner + step, width
 
