@@ -72,7 +72,13 @@ class InputError(Exception):
 
     @classmethod
     def gather(cls, problems: list[InputError]) -> InputError:
-        """One error that reports several, of which there is at least one."""
+        """One error that reports several.
+
+        Parameters
+        ----------
+        problems
+            The errors, at least one.
+        """
         first, *rest = problems
         return cls(first.source, first.field, first.value, first.expected, tuple(rest))
 

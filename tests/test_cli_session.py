@@ -202,7 +202,7 @@ def test_changed_setup_lists_stale_results(labapp: Run, measured: Path, tmp_path
     assert "Now stale: 6 results (frames 0 to 5)" in stdout
     assert f"labapp session measure {measured}" in stdout
     code, stdout, _ = labapp("session", "undo", measured)
-    assert stdout.startswith("Undone: setup (of ")
+    assert stdout.startswith("Undone: set-up (of ")
     assert "No longer stale: 6 results (frames 0 to 5)" in stdout
     _, stdout, _ = labapp("session", "setup", measured, SETUP)
     assert stdout == "The set-up is the same as before\n"
@@ -902,7 +902,7 @@ def test_info_as_json(labapp: Run, measured: Path) -> None:
     assert info["recording"]["frame_rate_hz"] == 100
     assert info["recording"]["missing"] is None
     assert [(c["label"], c["undone"]) for c in info["history"]] == [
-        ("setup", False),
+        ("set-up", False),
         ("scheme irs", True),
     ]
 

@@ -176,7 +176,7 @@ def test_correction_makes_its_frame_stale_and_is_listed(
     add_corrections(story, ReportData.of(session, None, None))
     count = str(len(moved.dots))
     assert story.tables[0][1:] == [["2", count, "2", "blocked rows 3"]]
-    assert [row[2] for row in story.tables[1]][1:] == ["setup", "settings", "correction"]
+    assert [row[2] for row in story.tables[1]][1:] == ["set-up", "settings", "correction"]
     store(2, correction=session.correction(2))
     assert frame_lines(session)[2].state == "corrected by hand"
 

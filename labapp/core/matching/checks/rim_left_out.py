@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from scipy.special import bdtrc
 
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
@@ -51,6 +50,8 @@ def refuse_rim_left_out(observed: Observation, labels: IntArray) -> None:
     dots = _steps_off(observed, labels, observed.plane_mm[free])
     if np.count_nonzero(dots < REACHES[-1]) < LEAST_NEAR:
         return
+    from scipy.special import bdtrc  # takes a fifth of a second, and few frames need it
+
     height, width = observed.frame_shape
     u, v = np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID))
     places_mm = observed.bench.calibration.to_plane(np.stack([u, v], axis=-1).reshape(-1, 2))
