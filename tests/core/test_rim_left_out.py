@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.matching.checks.rim_left_out import refuse_rim_left_out
 from labapp.core.matching.observation import UNLABELLED, Observation, neighbours_of
+from labapp.core.pipeline import Settings
+from labapp.core.recording.chain import WarmChain
 from labapp.core.values import CannotMeasure, IntArray
+from labapp.simulation.forward import trace
 from labapp.simulation.pools import Footprint, Pool, egg
+from labapp.simulation.render import Look, render
 from tests.benchmarks.dips import measure_pool
+from tests.benchmarks.rendered import draw_view
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, see, true_labels
 
 SMOOTH = egg(5.4, 2.6, 3.0, 0.27)
@@ -51,9 +57,24 @@ def test_dots_left_out_all_round_are_refused() -> None:
     assert refusal.value.status == "no-match"
 
 
-def test_few_dots_left_out_are_accepted() -> None:
+@pytest.mark.parametrize("rows", [1, 2])
+def test_few_dots_left_out_are_accepted(rows: int) -> None:
     observed, labels = frame()
-    refuse_rim_left_out(observed, without_ends(labels, rows=1))
+    refuse_rim_left_out(observed, without_ends(labels, rows))
+
+
+def test_followed_pool_is_not_measured_when_its_rim_becomes_steep() -> None:
+    rng = np.random.default_rng(1)
+    view = draw_view(rng)
+    axes = (view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm)
+    chain = WarmChain(Bench(BENCH_RIG, ImageCalibration.from_three_points(*axes)), Settings())
+    statuses = []
+    for fullness in (0.7, 0.75, 0.85):
+        pool = Pool(Footprint(5.8, 3.2, 3.5), 0.2, fullness=fullness)
+        statuses.append(
+            chain.measure(render(trace(pool, BENCH_RIG), view, Look(), rng).image).status
+        )
+    assert statuses == ["ok", "ok", "no-match"]
 
 
 def test_false_dots_anywhere_are_accepted() -> None:

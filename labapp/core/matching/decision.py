@@ -130,7 +130,7 @@ def decide(
             rivals.append((other.labels, _excess(other, cheapest)))
     best = supported(observed, _without(observed, best, doubtful, fit_settings), fit_settings)
     best = _with_unknown(observed, best, ended.labels, fit_settings)
-    with_rim = best.labels
+    with_rim = best.labels  # dots beyond a hidden row lose their rays, but were not left out
     refuse_much_in_doubt(best)
     _refuse_hidden_marker(observed, best)
     best = _without_rays(

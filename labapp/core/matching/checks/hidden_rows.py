@@ -19,7 +19,7 @@ from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
 FEW, MOST_FREED = 4, 8
 """If at most the second number of dots are beyond a hidden row, they lose their rays; otherwise the
-frame is refused. The first, or fewer, tell little of it."""
+frame is refused. The first, or fewer, are weak evidence."""
 
 WIDE_GAP, WIDE_GAP_FREED = 1.45, 1.35
 """A row may be hidden in a gap that exceeds by this factor what follows from the two gaps before
