@@ -105,7 +105,8 @@ class Candidate:
     Parameters
     ----------
     match
-        The match; None if no surface fits its rays with the set-up as entered.
+        The match; None if no surface fits its rays with the set-up as entered, or its rim is left
+        out.
     step
         Offset of its rays from those of the first candidate, in rows and columns.
     cost

@@ -8,6 +8,9 @@ import pytest
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.matching.checks.rim_left_out import refuse_rim_left_out
+from labapp.core.matching.free_setup import FreeHypothesis
+from labapp.core.matching.hypothesis import evaluate
+from labapp.core.matching.match_rays import match_of_hypothesis, open_candidates
 from labapp.core.matching.observation import UNLABELLED, Observation, neighbours_of
 from labapp.core.pipeline import Settings
 from labapp.core.recording.chain import WarmChain
@@ -40,7 +43,8 @@ def without_ends(labels: IntArray, rows: int) -> IntArray:
 
 
 @pytest.mark.parametrize(
-    ("width", "peak", "fullness"), [(6.0, 0.28, 0.8), (5.4, 0.2, 0.85), (5.4, 0.2, 0.93)]
+    ("width", "peak", "fullness"),
+    [(6.0, 0.28, 0.8), (5.4, 0.2, 0.85), (5.4, 0.2, 0.93), (5.2, 0.24, 0.95)],
 )
 def test_pool_with_steep_sides_is_not_measured_too_low(
     width: float, peak: float, fullness: float
@@ -55,6 +59,18 @@ def test_dots_left_out_all_round_are_refused() -> None:
     with pytest.raises(CannotMeasure) as refusal:
         refuse_rim_left_out(observed, without_ends(labels, rows=4))
     assert refusal.value.status == "no-match"
+
+
+@pytest.mark.parametrize(("rows", "is_measured"), [(0, True), (4, False)])
+def test_no_other_frame_decides_for_open_rows_without_the_rim(rows: int, is_measured: bool) -> None:
+    observed, labels = frame()
+    labels = without_ends(labels, rows)
+    hypothesis = evaluate(observed, labels)
+    assert hypothesis is not None
+    own = match_of_hypothesis(observed, hypothesis, hypothesis.orientation(observed))
+    holes = [FreeHypothesis(labels, cost=0.0), FreeHypothesis(labels, step=(0, 1), cost=5.0)]
+    candidates = list(open_candidates(observed, own, holes))
+    assert [each.match is not None for each in candidates] == [is_measured, is_measured]
 
 
 @pytest.mark.parametrize("rows", [1, 2])

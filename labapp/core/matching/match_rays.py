@@ -35,6 +35,7 @@ from labapp.core.match import (
     missing_share,
     signs_of,
 )
+from labapp.core.matching.checks.rim_left_out import is_rim_left_out
 from labapp.core.matching.checks.unexplained import (
     MOST_SCATTERED,
     MOST_SCATTERED_AT_LAST,
@@ -169,20 +170,34 @@ def match_rays(
         raise RowsOpen(
             "several holes in the rows can be the absent centre dot, perhaps because the set-up is "
             "slightly wrong",
-            tuple(_candidates(observed, match, open_holes)),
+            tuple(open_candidates(observed, match, open_holes)),
         )
     return match, best.pool.surface
 
 
-def _candidates(
+def open_candidates(
     observed: Observation, own: Match, open_holes: list[FreeHypothesis]
 ) -> Iterator[Candidate]:
-    """Yield the matches of the open hypotheses, that of the likeliest first."""
+    """Yield the matches of the open hypotheses, that of the likeliest first.
+
+    There is no match where the rim is left out, so that no other frame can decide for it.
+
+    Parameters
+    ----------
+    observed
+        The dots.
+    own
+        The match of the first hypothesis.
+    open_holes
+        The hypotheses (`free_setup.holes_left_open`).
+    """
     least = open_holes[0]
-    yield Candidate(own, (0, 0), 0.0)
+    labels = np.full(own.ray_states.shape, UNLABELLED)
+    labels[tuple(own.ray.T - 1)] = own.dot
+    yield Candidate(None if is_rim_left_out(observed, labels) else own, (0, 0), 0.0)
     for each in open_holes[1:]:
         rival, match = evaluate(observed, each.labels), None
-        if rival is not None:
+        if rival is not None and not is_rim_left_out(observed, each.labels):
             rival = supported(observed, rival, USUAL_FIT)
             match = match_of_hypothesis(observed, rival, own.orientation)
         yield Candidate(match, each.step, each.cost - least.cost)
