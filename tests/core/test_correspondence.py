@@ -462,6 +462,17 @@ def test_dots_in_doubt_get_rays_consistent_with_assigned_numbers() -> None:
 
 
 @pytest.mark.slow
+def test_corrected_frame_with_many_false_dots_is_measured() -> None:
+    seen = see(CONVEX, np.random.default_rng(5), sigma_px=0.1, false=12)
+    match, refusal = matched(seen.dots)
+    assert match is not None, refusal
+    correction, reference = by_hand(seen)
+    again = corrected(set_reference(correction, reference))
+    assert len(again.dot) == len(seen.ray) - 12
+    np.testing.assert_array_equal(again.ray, seen.ray[again.dot])
+
+
+@pytest.mark.slow
 def test_rows_without_a_reference_are_matched_as_a_block() -> None:
     seen = exact(CONVEX)
     correction, reference = by_hand(seen)

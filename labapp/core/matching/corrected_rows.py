@@ -15,6 +15,7 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import Match, Orientation, signs_of
+from labapp.core.matching.checks.unexplained import is_scattered
 from labapp.core.matching.hypothesis import (
     WIDE_FIT,
     Hypothesis,
@@ -189,11 +190,15 @@ def _found_reference(match: Match, rows: Lattice, rig: Rig) -> Site:
 
 
 def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
-    """Raise ``no-match`` if the surface contradicts the sites, and name the worst row."""
-    observed, labels = bound.observed, bound.hypothesis.labels
+    """Raise ``no-match`` if the surface contradicts the sites, and name the worst row.
+
+    Isolated dots may remain without a ray, as in a frame without a correction: they are false.
+    """
+    observed, best = bound.observed, bound.hypothesis
+    labels = best.labels
     dot = labels[labels != UNLABELLED]
     next_mm = scipy.spatial.cKDTree(observed.plane_mm).query(observed.plane_mm, k=2)[0][dot, 1]
-    off = np.linalg.norm(bound.hypothesis.pool.residual_mm, axis=-1) > OFF_SPACINGS * next_mm
+    off = np.linalg.norm(best.pool.residual_mm, axis=-1) > OFF_SPACINGS * next_mm
     wrong, sited = dot[off & (rows.row[dot] > 0)], int((rows.row > 0).sum())
     if len(wrong) > max(2, FEW_OFF * sited):
         raise CannotMeasure(
@@ -201,9 +206,10 @@ def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
             f"the correction does not fit: {len(wrong)} of {sited} dots given a row and a column "
             f"are far from any surface's prediction, most in row {_most(rows.row[wrong])}",
         )
-    stray = bound.hypothesis.stray_count
-    if stray > settings.most_strays(len(observed.plane_mm)):
-        reason = f"the correction leaves {stray} of {len(observed.plane_mm)} dots without a ray"
+    isolated = is_scattered(observed, labels, best.missed_rays, best.stray_dots)
+    left, count = best.stray_count, len(observed.plane_mm)
+    if left > settings.most_strays(count) and (len(bound.contested) or not isolated):
+        reason = f"the correction leaves {left} of {count} dots without a ray"
         if len(bound.contested):
             row = _most(rows.row[bound.contested])
             reason += f", as the surface contradicts dots that are given row {row}"
