@@ -26,6 +26,7 @@ from labapp.errors import InputError
 from labapp.run import measurers
 from labapp.session.checklist import SAFETY, STEPS
 from labapp.session.frames import Frames
+from labapp.session.record import LaserEntries
 from labapp.session.results.measured import StoredResults
 from labapp.session.session import Session
 from tests.conftest import Run
@@ -905,6 +906,16 @@ def test_info_as_json(labapp: Run, measured: Path) -> None:
         ("set-up", False),
         ("scheme irs", True),
     ]
+
+
+def test_info_lists_what_waits_to_be_applied(labapp: Run, measured: Path) -> None:
+    with Session.open(measured) as session:
+        session.set_entries("laser", LaserEntries((("4.6", "", ""),), 10.0, 0.1, 0.05))
+        assert (
+            "waiting    laser readings: not applied yet" in labapp("session", "info", measured)[1]
+        )
+        session.set_entries("laser", None)
+        assert "waiting" not in labapp("session", "info", measured)[1]
 
 
 def test_info_lists_missing_parts_and_unusual_settings(labapp: Run, tmp_path: Path) -> None:

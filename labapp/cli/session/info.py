@@ -82,6 +82,7 @@ def _facts(session: Session) -> dict[str, Any]:
             "mirrors": [one.kind for one in check.pictures],
             "in_use": not session.setup_problems and bool(session.setup.check_date),
         },
+        "not_applied": [name for name, entries in _entries(session).items() if entries is not None],
         "settings": _differences(session.settings, Settings()),
         "scheme": scheme_name(session.settings),
         "frames": len(seen.frame),
@@ -96,6 +97,15 @@ def _facts(session: Session) -> dict[str, Any]:
             "undoable": sum(not change.undone for change in session.history),
             "redoable": sum(change.undone for change in session.history),
         },
+    }
+
+
+def _entries(session: Session) -> dict[str, object]:
+    """Return what was entered on the pages of calibration and bench check, and not applied yet."""
+    return {
+        "laser readings": session.laser_entries,
+        "imaging-plane points": session.plane_entries,
+        "bench-check pictures": session.bench_entries,
     }
 
 
@@ -170,6 +180,8 @@ def _calibration_lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     if check := facts["bench_check"]:
         now = "in use" if check["in_use"] else "the set-up was changed since"
         lines.append(("checked", f"{check['date'][:10]}, {', '.join(check['mirrors'])}; {now}"))
+    if entered := facts["not_applied"]:
+        lines.append(("waiting", f"{', '.join(entered)}: not applied yet"))
     return lines
 
 
