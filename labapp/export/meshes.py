@@ -112,9 +112,12 @@ def known_part(triangles: IntArray, value: FloatArray) -> tuple[IntArray, IntArr
     used, triangles
         Indices of their vertices, shape (m,), and the triangles by indices into these.
     """
-    triangles = triangles[np.isfinite(value[triangles]).all(axis=1)]
-    used, corner = np.unique(triangles, return_inverse=True)
-    return used, corner.reshape(triangles.shape)
+    known, is_used = np.isfinite(value), np.zeros(len(value), bool)
+    if known.all():
+        return np.arange(len(value)), triangles
+    triangles = triangles[known[triangles].all(axis=1)]
+    is_used[triangles] = True
+    return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[triangles]
 
 
 def solid_mesh(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
@@ -184,11 +187,11 @@ def _walls(rim: IntArray, below: int) -> list[IntArray]:
 
 def stl(mesh: Mesh) -> bytes:
     """Return binary STL, without degenerate triangles."""
-    normal, corners = _facets(mesh)
-    facets = np.zeros(len(corners), STL_TRIANGLE)
-    facets["normal"], facets["corner"] = normal, corners
+    numbers = _facets(mesh)
+    facets = np.zeros(len(numbers), STL_TRIANGLE)
+    facets["normal"], facets["corner"] = numbers[:, :3], numbers[:, 3:].reshape(-1, 3, 3)
     title = b"labapp pool surface, mm".ljust(80)
-    return b"".join([title, len(facets).to_bytes(4, "little"), facets.tobytes()])
+    return b"".join([title, len(facets).to_bytes(4, "little"), facets.data])
 
 
 def stl_ascii(mesh: Mesh) -> bytes:
@@ -198,19 +201,15 @@ def stl_ascii(mesh: Mesh) -> bytes:
         + "vertex {:.8e} {:.8e} {:.8e}\n" * 3
         + "endloop\nendfacet\n"
     )
-    normal, corners = _facets(mesh)
-    numbers = np.column_stack([normal, corners.reshape(-1, 9)]).astype(np.float32).tolist()
-    facets = "".join(facet.format(*each) for each in numbers)
+    facets = "".join(facet.format(*each) for each in _facets(mesh).tolist())
     return f"solid labapp_pool_surface_mm\n{facets}endsolid labapp_pool_surface_mm\n".encode()
 
 
-def _facets(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
-    """Return unit normals, shape (k, 3), and corners, shape (k, 3, 3), of the proper triangles."""
-    corners = mesh.vertices_mm[mesh.triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normal, axis=1, keepdims=True)
-    whole = area[:, 0] > 0
-    return normal[whole] / area[whole], corners[whole]
+def _facets(mesh: Mesh) -> npt.NDArray[np.float32]:
+    """Return unit normal and three corners of the proper triangles, shape (k, 12)."""
+    from labapp.export.mesh_kernels import facets  # loads numba
+
+    return facets(mesh.vertices_mm, mesh.triangles)
 
 
 def ply(mesh: Mesh) -> bytes:

@@ -5,7 +5,6 @@ Values have full precision; only CSV is rounded. An unknown value is NaN, and an
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -26,7 +25,6 @@ from labapp.export.frame_result import FrameResult
 from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, as_cell, csv_text, unescaped_csv_text
 
 PX_DIGITS, MM_DIGITS = 4, 6
-_NEGATIVE_ZERO = f"{-0.0:.{MM_DIGITS}f}"
 
 UNITS = ("mm", "mm2", "mm3", "px", "deg", "s")
 NO_UNIT = "1"
@@ -143,6 +141,9 @@ TABLES: dict[str, tuple[Column, ...]] = {
     ),
 }
 """The tables and their columns, in the order of writing."""
+
+NODES = tuple(Column(f"{axis}_mm", f"{axis.upper()} of the node") for axis in "xyz")
+"""Columns of a surface as CSV."""
 
 _NAMES = {name: [column.name for column in columns] for name, columns in TABLES.items()}
 _MEASURED = {field.name for field in fields(Measures)}
@@ -284,7 +285,10 @@ def csv_header(name: str, sigma_parts: bool = False) -> str:
 
 def csv_rows(name: str, table: Columns, sigma_parts: bool = False) -> str:
     """Return a table's rows as CSV text, without header, rounded to the decimals of `TABLES`."""
-    columns = columns_of(name, sigma_parts)
+    return _rows(columns_of(name, sigma_parts), table)
+
+
+def _rows(columns: Sequence[Column], table: Columns) -> str:
     text = _numeric_rows(columns, table)
     if text is not None:
         return text
@@ -322,9 +326,8 @@ def _numeric_rows(columns: Sequence[Column], table: Columns) -> str | None:
 
 def nodes_csv(nodes: FloatArray) -> bytes:
     """Return the nodes of a surface, shape (n, 3), mm, as CSV `x_mm,y_mm,z_mm`."""
-    text = io.StringIO()
-    np.savetxt(text, nodes, f"%.{MM_DIGITS}f", ",", header="x_mm,y_mm,z_mm", comments="")
-    return text.getvalue().replace(_NEGATIVE_ZERO, _NEGATIVE_ZERO[1:]).encode()
+    table = {column.name: values for column, values in zip(NODES, nodes.T, strict=True)}
+    return (csv_text([list(table)]) + _rows(NODES, table)).encode()
 
 
 def number(value: float | None, digits: int = MM_DIGITS) -> str:

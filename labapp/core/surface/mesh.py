@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from labapp.core.surface.measures import grid_within, spoke_points
@@ -14,7 +16,7 @@ def grid_nodes(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Nodes x, y, z of a grid through the origin within the boundary, shape (n,) each, mm."""
     x, y = grid_within(reconstruction.boundary, spacing_mm)
-    return x, y, reconstruction.surface.height(x, y)
+    return x, y, reconstruction.unbounded.height(x, y)
 
 
 def surface_mesh(reconstruction: Reconstruction, spacing_mm: float) -> tuple[FloatArray, IntArray]:
@@ -33,7 +35,7 @@ def surface_mesh(reconstruction: Reconstruction, spacing_mm: float) -> tuple[Flo
         Shape (n, 3), mm, the centre first and the boundary last; and indices, shape (k, 3),
         counter-clockwise seen from above.
     """
-    boundary, surface = reconstruction.boundary, reconstruction.surface
+    boundary, surface = reconstruction.boundary, reconstruction.unbounded
     radius = np.linalg.norm(boundary.points_mm[:, :2] - boundary.center_mm, axis=-1).max()
     rings = max(int(np.ceil(radius / spacing_mm)), 1)
     count = len(boundary.points_mm)
@@ -41,6 +43,12 @@ def surface_mesh(reconstruction: Reconstruction, spacing_mm: float) -> tuple[Flo
     x, y = boundary.center_mm
     centre = [x, y, surface.height(np.asarray(x), np.asarray(y))]
     vertices = np.vstack([centre, inner.transpose(1, 0, 2).reshape(-1, 3), boundary.points_mm])
+    return vertices, _ring_triangles(rings, count)
+
+
+@lru_cache(maxsize=4)
+def _ring_triangles(rings: int, count: int) -> IntArray:
+    """Triangles of `surface_mesh` with so many rings and boundary points; kept for all frames."""
     here = np.arange(count)
     after = np.roll(here, -1)
     triangles = [np.column_stack([np.zeros(count, int), 1 + here, 1 + after])]
@@ -48,4 +56,6 @@ def surface_mesh(reconstruction: Reconstruction, spacing_mm: float) -> tuple[Flo
         a, b = 1 + ring * count, 1 + (ring + 1) * count
         triangles.append(np.column_stack([a + here, b + here, b + after]))
         triangles.append(np.column_stack([a + here, b + after, a + after]))
-    return vertices, np.vstack(triangles)
+    made = np.vstack(triangles)
+    made.flags.writeable = False
+    return made
