@@ -10,19 +10,17 @@ frames measured without tracking (`COLD_AT_START`), so that results do not depen
 
 from __future__ import annotations
 
-import functools
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
-from threadpoolctl import ThreadpoolController
 
 from labapp.config.setup import Setup
 from labapp.core.pipeline import FrameCorrection, Measurement, Settings, measure
@@ -33,11 +31,12 @@ from labapp.export.tables import table_rows
 from labapp.media import Frame, GreyImage, open_source
 from labapp.simulation.parallel import (
     NICE,
-    ONE_THREAD,
     InlineExecutor,
+    blas,
     held,
     hold,
     in_order,
+    one_thread,
     worker_pool,
 )
 
@@ -163,28 +162,9 @@ def _cold(
     number: int, frame: Frame, setup: Setup, settings: Settings, correction: FrameCorrection | None
 ) -> FrameResult:
     """Measure a frame independently, with its manual correction, if any."""
-    with _one_thread():
+    with one_thread():
         found, _ = measure(frame.image, setup.bench, settings, None, correction)
     return FrameResult(number, frame.time_s, found)
-
-
-def _one_thread() -> AbstractContextManager[object]:
-    """Limit BLAS to one thread: the matrices are small, and more threads are slower.
-
-    A worker process has this limit from its start: setting it takes a hundredth of a frame's time.
-    """
-    if all(os.environ.get(name) == "1" for name in ONE_THREAD):
-        return nullcontext()
-    limited: AbstractContextManager[object] = _threads().limit(limits=1, user_api="blas")
-    return limited
-
-
-@functools.cache
-def _threads() -> ThreadpoolController:
-    """Return the controller of the loaded BLAS libraries; cached, as it takes milliseconds."""
-    import scipy.linalg  # noqa: F401 - loads SciPy's own BLAS
-
-    return ThreadpoolController()
 
 
 def measuring_pool(workers: int) -> ProcessPoolExecutor:
@@ -238,7 +218,7 @@ class WarmMeasurer:
                     warm.skip()
                     yield _cold(number, frame, self.setup, self.settings, correction)
                 else:
-                    with _one_thread():
+                    with one_thread():
                         found = warm.measure(frame.image)
                     yield FrameResult(number, frame.time_s, found, warm.track_lost)
 
@@ -297,7 +277,7 @@ def _skip_in_chain() -> None:
 
 def _measure_in_chain(image: GreyImage) -> tuple[Measurement, str | None]:
     warm: WarmChain = held()
-    with _one_thread():
+    with one_thread():
         found = warm.measure(image)
     return found, warm.track_lost
 
@@ -431,4 +411,4 @@ def load_all() -> None:
     import labapp.export.fixed_point
     import labapp.media.formats.video  # noqa: F401
 
-    _threads()
+    blas()

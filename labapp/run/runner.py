@@ -20,6 +20,7 @@ from labapp.core.recording.residual_check import ResidualRecord
 from labapp.errors import InputError, require
 from labapp.export.frame_result import FrameResult
 from labapp.media import FrameSource
+from labapp.simulation.parallel import one_thread
 
 Measurer = Callable[[Iterable[int]], Generator[FrameResult]]
 """Measures frames, given by their numbers, in order. Closing it cancels frames in progress."""
@@ -48,7 +49,8 @@ def with_setup_check(measurer: Measurer, record: ResidualRecord) -> Measurer:
     """Return a measurer whose results include the check of the set-up by the frames so far."""
 
     def measure(frames: Iterable[int]) -> Generator[FrameResult]:
-        with closing(measurer(frames)) as results:
+        # More threads would also take the processors from the measuring processes.
+        with one_thread(), closing(measurer(frames)) as results:
             for result in results:
                 measurement = record.add_and_judge(result.measurement, result.residuals)
                 yield replace(result, measurement=measurement, setup_doubt=record.doubt)

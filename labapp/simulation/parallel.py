@@ -10,11 +10,11 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from typing import Any, TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from labapp.system import ignore_interrupts, interrupts_blocked, lower_priority
 
@@ -38,6 +38,25 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of the work, the steps done and the number of steps; may raise to stop."""
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Limit BLAS to one thread: the matrices are small, and more threads are slower.
+
+    A worker process has this limit from its start: setting it takes a hundredth of a frame's time.
+    """
+    if all(os.environ.get(name) == "1" for name in ONE_THREAD):
+        return nullcontext()
+    limited: AbstractContextManager[object] = blas().limit(limits=1, user_api="blas")
+    return limited
+
+
+@functools.cache
+def blas() -> ThreadpoolController:
+    """Return the controller of the loaded BLAS libraries; cached, as it takes milliseconds."""
+    import scipy.linalg  # noqa: F401 - loads SciPy's own BLAS
+
+    return ThreadpoolController()
 
 
 def in_parallel(

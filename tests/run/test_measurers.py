@@ -332,26 +332,49 @@ THREADS = """
     import numpy as np
     from labapp.config.setup import read_setup
     from labapp.core.pipeline import Measurement, Settings
+    from labapp.core.recording.residual_check import ResidualRecord
+    from labapp.export.frame_result import FrameResult
     from labapp.media import Frame
+    from labapp.run.runner import with_setup_check
     from threadpoolctl import ThreadpoolController
 
-    def measure(*_):
+    def print_threads():
         import scipy.linalg
         libraries = ThreadpoolController().select(user_api="blas").info()
         print({library["num_threads"] for library in libraries})
-        return Measurement("no-dots", "it is dark", "fit"), None
+
+    dark = Measurement("no-dots", "it is dark", "fit")
+    setup = read_setup("sample_sessions/gtaw/setup.toml")
+"""
+
+MEASURING = """
+    def measure(*_):
+        print_threads()
+        return dark, None
 
     measurers.measure = measure
-    setup = read_setup("sample_sessions/gtaw/setup.toml")
     frame = Frame(0, None, np.zeros((2, 2), np.uint8))
     list(measurers.ColdMeasurer(lambda _: frame, setup, Settings())([0]))
 """
 
+JUDGING = """
+    class Record(ResidualRecord):
+        def add_and_judge(self, measurement, residuals=None):
+            print_threads()
+            return measurement
 
-def test_linear_algebra_uses_one_thread_from_the_first_frame() -> None:
+    def in_other_processes(frames):
+        yield from (FrameResult(frame, None, dark) for frame in frames)
+
+    list(with_setup_check(in_other_processes, Record(setup.rig))([0]))
+"""
+
+
+@pytest.mark.parametrize("part", [MEASURING, JUDGING], ids=["measuring", "judging"])
+def test_linear_algebra_uses_one_thread_from_the_first_frame(part: str) -> None:
     """This includes the libraries of SciPy, which may not have been imported before."""
     process = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(THREADS)],
+        [sys.executable, "-c", textwrap.dedent(THREADS) + textwrap.dedent(part)],
         capture_output=True,
         text=True,
         check=False,
