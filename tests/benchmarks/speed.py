@@ -1,9 +1,10 @@
 """Speed of measuring: followed and cold frames, their dots, and a video from file to CSV.
 
 Run as ``python -m tests.benchmarks.speed [--frames N] [--cache FOLDER] [--cases FOLDER …]``. The
-video is that of `labapp benchmark`. A folder of cases has a folder each with ``frame.png`` and
-``setup.toml``; each frame is measured independently, after all have been measured once, which loads
-the compiled functions that only some frames need. Times are
+video is that of `labapp benchmark`. From file to CSV it is measured in this process, without the
+start and the check of the set-up, and by the command. A folder of cases has a folder each with
+``frame.png`` and ``setup.toml``; each frame is measured independently, after all have been measured
+once, which loads the compiled functions that only some frames need. Times are
 processor times on one core, unless stated otherwise. Each ratio is from one run: where other
 programs share the cores, ratios are more reliable than times. The profile contains the time of a
 followed frame by module, including the profiler's overhead, and calls of the costliest functions.
@@ -13,7 +14,10 @@ from __future__ import annotations
 
 import argparse
 import cProfile
+import os
 import pstats
+import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -39,6 +43,9 @@ from tests.benchmarks.detectors import detectors
 
 FOLLOWED, BEFORE, SEARCHED = 200, 20, 40
 """Frames followed under the profiler, frames before them, and frames whose dots are searched."""
+
+COMMAND_WANTED = {"none": "<= 50", "all": "<= 80"}
+"""Wanted processor time of `labapp reconstruct`, without and with the files of all surfaces."""
 
 COUNTED = {
     "fits of several rounds": "run_rounds",
@@ -91,6 +98,30 @@ def time_cases(folder: Path) -> None:
     print_ratio("  worst, ms", float(times_ms.max()), "<= 1000")
 
 
+def time_command(video: Video, out: Path) -> None:
+    """Print the time of `labapp reconstruct --warm` from its start to its end.
+
+    Its reference is the time in which this process decodes the video.
+    """
+    with open_source(video.path) as source:
+        decoding_s = seconds(lambda: [source.frame(number) for number in range(len(source))])
+    frames, setup = len(video.height_mm), video.path.with_suffix("") / "setup.toml"
+    command = [sys.executable, "-m", "labapp", "reconstruct", video.path, "--setup", setup]
+    for surfaces, wanted in COMMAND_WANTED.items():
+        begun, used = time.perf_counter(), sum(os.times()[2:4])
+        subprocess.run(
+            [*command, "--out", out, "--warm", "--surfaces", surfaces],
+            check=True,
+            capture_output=True,
+        )
+        rate, used = frames / (time.perf_counter() - begun), sum(os.times()[2:4]) - used
+        print(
+            f"reconstruct --warm --surfaces {surfaces}: {rate:.0f} frames a second, with its start"
+        )
+        print(f"  {1e3 * used / frames:.2f} ms of all processors a frame")
+        print_ratio("  processor time / decoding", used / decoding_s, wanted)
+
+
 def profile_followed(video: Video) -> None:
     """Print the time of a followed frame by module, from reading it to the text of its rows."""
     chain, profile = WarmChain(video.setup.bench, Settings()), cProfile.Profile(time.process_time)
@@ -133,10 +164,11 @@ def main() -> None:
     video = make_video(folder, chosen.frames)
     with tempfile.TemporaryDirectory(dir=folder) as out:
         run = run_video(video, Path(out) / "results", 2)
-    ms = 1e3 * run.processor_s / run.frames
-    print(f"from file to CSV, two processes, {run.frames} frames, {run.cold} of them cold")
-    print_ratio("  frames a second", run.frames / run.seconds, ">= 500")
-    print(f"  {ms:.2f} ms of all processors a frame, the start of the processes in it")
+        ms = 1e3 * run.processor_s / run.frames
+        print(f"from file to CSV, two processes, {run.frames} frames, {run.cold} of them cold")
+        print_ratio("  frames a second", run.frames / run.seconds, ">= 500")
+        print(f"  {ms:.2f} ms of all processors a frame, the start of the processes in it")
+        time_command(video, Path(out) / "command")
     cv2.setNumThreads(1)
     with ThreadpoolController().limit(limits=1, user_api="blas"):
         latency = time_frames(video, min(chosen.frames, 400))
