@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from labapp.core.surface.solver import fit_slopes
-from labapp.core.surface.spline import SplineBasis, SplineSurface
+from labapp.core.surface.spline import AT_ONCE, SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 
 LOW, HIGH = np.array([-3.0, -2.0]), np.array([2.0, 4.0])
@@ -50,6 +50,14 @@ def test_splines_add_up_to_one_and_none_is_negative() -> None:
     matrix = BASIS.matrix(*np.concatenate([places(200), corners]).T)
     np.testing.assert_allclose(matrix.sum(axis=1), 1.0, atol=1e-12)
     assert matrix.min() >= -1e-12
+
+
+def test_any_number_of_heights_is_the_sum_of_the_splines() -> None:
+    xy = np.concatenate([places(2 * AT_ONCE), LOW[None] - 1.0, places(AT_ONCE + 7, 1)])
+    surface = SplineSurface(BASIS, np.random.default_rng(2).normal(size=BASIS.count))
+    expected = BASIS.matrix(*xy.T) @ surface.coefficients
+    expected[2 * AT_ONCE] = np.nan
+    np.testing.assert_allclose(surface.height(*xy.T), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(("dx", "dy"), [(1, 0), (0, 1), (2, 0), (1, 1)])

@@ -207,6 +207,14 @@ def test_normals_of_stl_agree_with_its_triangles() -> None:
     np.testing.assert_array_equal(content["normal"], np.array(numbers, np.float32))
 
 
+def test_stl_has_only_triangles_with_an_area() -> None:
+    places = np.array([[0.0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 1], [6, 0, 0]])
+    mesh = Mesh(places, np.array([[0, 1, 2], [0, 1, 4], [2, 2, 3], [0, 3, 1]]))
+    content = np.frombuffer(meshes.stl(mesh)[84:], meshes.STL_TRIANGLE)
+    np.testing.assert_array_equal(content["normal"], [[0, 0, 1], [0, 1, 0]])
+    np.testing.assert_array_equal(content["corner"], places[[[0, 1, 2], [0, 3, 1]]])
+
+
 @both_meshes
 def test_ply_can_be_read_by_other_programs(mesh: Mesh, tmp_path: Path) -> None:
     content = meshes.ply(mesh)
