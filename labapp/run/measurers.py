@@ -42,6 +42,7 @@ from labapp.simulation.parallel import (
 
 if TYPE_CHECKING:
     from labapp.core.recording.chain import WarmChain
+    from labapp.core.recording.row_vote import Ballot, RowVote
 
 AHEAD = 8
 """Number of frames submitted to a pool of processes beyond the one whose result is awaited."""
@@ -91,7 +92,7 @@ class ColdMeasurer:
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
         measured = in_order(map(self._submit, frames), AHEAD)
-        return _with_rows_voted(measured, self.setup, self.settings)
+        return _with_rows_voted(measured, _new_vote(self.setup, self.settings))
 
     def _submit(self, number: int) -> Future[FrameResult]:
         """Read a frame in this process, and measure it in the pool, or at once if there is none."""
@@ -102,17 +103,20 @@ class ColdMeasurer:
         return pool.submit(_cold, number, frame, self.setup, self.settings, self.corrected(number))
 
 
+def _new_vote(setup: Setup, settings: Settings) -> RowVote:
+    from labapp.core.recording.row_vote import RowVote
+
+    return RowVote(setup.rig, settings)
+
+
 def _with_rows_voted(
-    measured: Generator[FrameResult], setup: Setup, settings: Settings, warm: bool = False
+    measured: Generator[FrameResult], vote: RowVote, warm: bool = False
 ) -> Generator[FrameResult]:
     """Yield results in order, with rows decided by a vote among neighbouring frames (`RowVote`).
 
     A frame is judged as soon as `VOTERS` frames with a surface are known, or after
     `MOST_WAITING` frames. ``warm``: frames are tracked, except where the track was lost.
     """
-    from labapp.core.recording.row_vote import Ballot, RowVote
-
-    vote = RowVote(setup.rig, settings)
     waiting: deque[tuple[FrameResult, Ballot]] = deque()
 
     def is_due() -> bool:
@@ -179,8 +183,10 @@ def measuring_pool(workers: int) -> ProcessPoolExecutor:
 class WarmMeasurer:
     """Tracks each frame from the previous one, in stretches (`WarmChain`).
 
-    A manually corrected frame is measured independently. Corrected frames, unreadable frames and
-    changes of the step between frames are gaps for the track (`WarmChain.skip`).
+    After a frame whose rows are outvoted the next is measured without tracking, and votes: if the
+    pool has moved by the spacing of the rays, the vote turns. A manually corrected frame is
+    measured independently. Corrected frames, unreadable frames and changes of the step between
+    frames are gaps for the track (`WarmChain.skip`).
     """
 
     read: Read
@@ -195,17 +201,18 @@ class WarmMeasurer:
         """Measure frames; see `runner.Measurer`."""
         rest = iter(frames)
         for first in rest:
-            stretch = self._stretch(chain([first], islice(rest, STRETCH - 1)))
-            yield from _with_rows_voted(stretch, self.setup, self.settings, warm=True)
+            vote = _new_vote(self.setup, self.settings)
+            stretch = self._stretch(chain([first], islice(rest, STRETCH - 1)), vote)
+            yield from _with_rows_voted(stretch, vote, warm=True)
 
-    def _stretch(self, frames: Iterable[int]) -> Generator[FrameResult]:
+    def _stretch(self, frames: Iterable[int], vote: RowVote) -> Generator[FrameResult]:
         warm, place = self._chain(), 0
         last: int | None = None
         step: int | None = None
         for read in self._read_ahead(frames):
             warm.look_ahead(frame.image for _, frame in read if isinstance(frame, Frame))
             for number, frame in read:
-                if place in COLD_AT_START:
+                if place in COLD_AT_START or vote.is_outvoted:
                     warm = self._chain()
                 before = None if last is None else number - last
                 if step is not None and before != step:

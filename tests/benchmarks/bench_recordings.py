@@ -77,6 +77,8 @@ def measured(scenes: list[Scene]) -> tuple[list[SceneResult], list[str]]:
     chain, vote = WarmChain(bench, settings), RowVote(bench.rig, settings)
     ballots, lost = [], []
     for scene in scenes:
+        if vote.is_outvoted:
+            chain = WarmChain(bench, settings)
         result = chain.measure(image_of(scene))
         is_tracked = chain.track_lost is None
         lost += [] if is_tracked else [str(chain.track_lost)]

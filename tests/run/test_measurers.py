@@ -20,8 +20,10 @@ import pytest
 from typer.testing import CliRunner
 
 from labapp.cli import app
-from labapp.config.setup import read_setup
+from labapp.config.setup import Setup, read_setup
 from labapp.core import pipeline
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.optics import project_rays
 from labapp.core.pipeline import Measurement, Settings, measure, start_correction
 from labapp.core.rows.correction import Correction
 from labapp.core.schemes import fit
@@ -43,6 +45,10 @@ from labapp.run.measurers import (
 )
 from labapp.session.record import Record
 from labapp.session.session import Session
+from labapp.simulation.camera import CameraView
+from labapp.simulation.forward import trace
+from labapp.simulation.pools import egg
+from labapp.simulation.render import Look, render
 from tests.same import assert_same
 from tests.simulated_recordings import simulated_recording
 
@@ -330,7 +336,7 @@ def test_frames_are_measured_one_at_a_time_without_a_pool(plain: Any) -> None:
 THREADS = """
     import labapp.run.measurers as measurers
     import numpy as np
-    from labapp.config.setup import read_setup
+    from labapp.config.setup import Setup, read_setup
     from labapp.core.pipeline import Measurement, Settings
     from labapp.core.recording.residual_check import ResidualRecord
     from labapp.export.frame_result import FrameResult
@@ -388,7 +394,7 @@ LOADED = """
     import sys
     from pathlib import Path
 
-    from labapp.config.setup import read_setup
+    from labapp.config.setup import Setup, read_setup
     from labapp.core.pipeline import Settings
     from labapp.run.measurers import RecordingMeasurer, load_all
 
@@ -459,6 +465,31 @@ def test_two_frames_whose_rows_differ_are_both_refused(
 ) -> None:
     results = list(slipping(1)(range(2)))
     assert [result.measurement.status for result in results] == ["ambiguous-rows"] * 2
+
+
+@pytest.mark.slow
+def test_frames_are_measured_again_after_the_pool_has_moved_by_a_row(
+    recording: RecordingMeasurer,
+) -> None:
+    rig, count, moved = recording.setup.rig, 12, 4
+    landing_mm = project_rays(rig.laser, rig.pattern).landing_mm
+    row_mm = float(landing_mm[10, 9, 1] - landing_mm[9, 9, 1])
+    view = CameraView((44.0, 590.0), (242.02, 590.0), 34.925, (44.0, 499.99), 15.875)
+    axes = view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm
+    setup = Setup(rig, ImageCalibration.from_three_points(*axes), "")
+
+    def read(number: int) -> Frame:
+        pool = egg(6.66, 3.0, 4.4, 0.29, (0.0, -0.6 if number < moved else -0.6 + row_mm))
+        rng = np.random.default_rng(number)
+        return Frame(number, None, render(trace(pool, rig), view, Look(), rng).image)
+
+    results = list(WarmMeasurer(read, setup, Settings())(range(count)))
+    statuses = [result.measurement.status for result in results]
+    assert statuses[:moved] == ["ok"] * moved
+    # The first frames after the move may be those with wrong rows, until the vote has turned.
+    assert statuses[moved] == "ambiguous-rows"
+    assert statuses[-4:] == ["ok"] * 4
+    assert results[-1].track_lost is None
 
 
 def test_results_before_a_failure_are_returned(

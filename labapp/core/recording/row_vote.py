@@ -136,6 +136,11 @@ class RowVote:
         rejected = replace(measured, match=None, reconstruction=None, measures=None)
         return replace(rejected, status="ambiguous-rows", reason=reason)
 
+    @property
+    def is_outvoted(self) -> bool:
+        """Whether the frames that are currently tracked have no majority for their rows."""
+        return bool(self._votes) and not self._has_majority(self._at)
+
     def _has_majority(self, at: tuple[int, int]) -> bool:
         return 2 * self._votes[at] > self._votes.total()
 
