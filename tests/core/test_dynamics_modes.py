@@ -125,6 +125,16 @@ def test_standard_uncertainties_cover_the_truth():
     assert (np.sqrt(np.mean(np.square(scores), axis=0)) > 0.8).all()
 
 
+@pytest.mark.parametrize("hertz", [22.0, 35.2])
+def test_frequency_is_not_doubled_if_the_crests_are_missing(hertz):
+    rng, time = np.random.default_rng(8), np.arange(60) / 200
+    value = 0.02 * np.cos(2 * np.pi * hertz * time + 1.0)
+    kept = value < 0.008
+    (found,) = fit_oscillations(time[kept], (value + rng.normal(0, 2e-4, 60))[kept], 1)
+    assert abs(found.frequency_hz - hertz) < 5 * found.frequency_sigma_hz
+    assert abs(abs(found.amplitude[0]) - 0.02) < 0.001
+
+
 def test_noise_alone_has_no_oscillation():
     rng = np.random.default_rng(3)
     time = np.arange(200) / 200
