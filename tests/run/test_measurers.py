@@ -336,7 +336,7 @@ def test_frames_are_measured_one_at_a_time_without_a_pool(plain: Any) -> None:
 THREADS = """
     import labapp.run.measurers as measurers
     import numpy as np
-    from labapp.config.setup import Setup, read_setup
+    from labapp.config.setup import read_setup
     from labapp.core.pipeline import Measurement, Settings
     from labapp.core.recording.residual_check import ResidualRecord
     from labapp.export.frame_result import FrameResult
@@ -394,7 +394,7 @@ LOADED = """
     import sys
     from pathlib import Path
 
-    from labapp.config.setup import Setup, read_setup
+    from labapp.config.setup import read_setup
     from labapp.core.pipeline import Settings
     from labapp.run.measurers import RecordingMeasurer, load_all
 
