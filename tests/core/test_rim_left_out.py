@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -130,3 +130,9 @@ def test_dots_left_out_within_the_others_are_accepted() -> None:
     inner = np.argwhere(neighbours_of(labels != UNLABELLED) == 8)[:8]
     labels[tuple(inner.T)] = UNLABELLED
     refuse_rim_left_out(observed, labels)
+
+
+def test_dots_that_fill_the_frame_are_accepted() -> None:
+    observed, labels = frame()
+    cut = replace(observed, frame_shape=(1, 1))
+    refuse_rim_left_out(cut, without_ends(labels, rows=4))

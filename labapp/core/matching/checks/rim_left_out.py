@@ -33,6 +33,9 @@ than of places anywhere by this number of σ. Of 75 pools with a steep rim or a 
 been measured over 6 % too low, 69 exceed one of the two limits, and 3 of the others had fewer than
 `LEAST_FREE` dots without a ray; of 109 right frames with up to 12 false dots, 2."""
 
+SAME = 1e-9
+"""Places whose values deviate by less cannot be told apart: the dots fill the frame."""
+
 GRID = 30
 """Number of places along each side of the frame with which the dots are compared."""
 
@@ -83,13 +86,14 @@ def is_rim_left_out(observed: Observation, labels: IntArray) -> bool:
 def _ahead(dots: FloatArray, places: FloatArray, explained: int = 0) -> float:
     """By how many σ the mean over dots exceeds that over places; −∞ for less than `LEAST_FREE`.
 
-    Both have values from 0 to 1, shapes (n,) and (m,). Dots of value 1 are omitted if explained.
+    Both have values from 0 to 1, shapes (n,) and (m,). That many dots of value 1 are explained
+    otherwise, and omitted.
     """
-    count = len(dots) - explained
-    if count < LEAST_FREE or not places.any():
+    count, spread = len(dots) - explained, places.std() if len(places) else 0.0
+    if count < LEAST_FREE or spread < SAME:
         return -np.inf
     ahead = (dots.sum() - explained) / count - places.mean()
-    return float(ahead / places.std() * np.sqrt(count))
+    return float(ahead / spread * np.sqrt(count))
 
 
 def _within(hull_mm: FloatArray, places_mm: FloatArray) -> BoolArray:
@@ -107,7 +111,7 @@ def _continuation(last_mm: FloatArray, steps_mm: FloatArray, places_mm: FloatArr
     along = np.maximum(np.sum(off * steps_mm, axis=-1) / square, 0.01)  # 0 for those behind
     across = (off[..., 0] * steps_mm[:, 1] - off[..., 1] * steps_mm[:, 0]) / square
     far, turned = np.log(along / STEP) / STEP_SPREAD, across / along / TURN
-    return np.asarray(np.exp(-(far**2 + turned**2) / 2).max(axis=1, initial=0.0))
+    return np.asarray(np.exp(-(far**2 + turned**2).min(axis=1, initial=np.inf) / 2))
 
 
 def _ends(observed: Observation, labels: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -119,4 +123,4 @@ def _ends(observed: Observation, labels: IntArray) -> tuple[FloatArray, FloatArr
             dot_mm, before_mm = observed.plane_mm[line[[end, before]]]
             last.append(dot_mm)
             steps.append((dot_mm - before_mm) / abs(end - before))
-    return np.array(last), np.array(steps)
+    return np.reshape(last, (-1, 2)), np.reshape(steps, (-1, 2))
