@@ -159,6 +159,8 @@ def main() -> None:
     parser.add_argument("--cache", type=Path)
     parser.add_argument("--cases", type=Path, nargs="*", default=[])
     chosen = parser.parse_args()
+    if chosen.frames < BEFORE + FOLLOWED:
+        parser.error(f"--frames {chosen.frames}: expected at least {BEFORE + FOLLOWED}")
     folder = chosen.cache or Path(platformdirs.user_cache_dir("labapp")) / "benchmark"
     folder.mkdir(parents=True, exist_ok=True)
     video = make_video(folder, chosen.frames)
