@@ -207,7 +207,7 @@ def stl_ascii(mesh: Mesh) -> bytes:
 
 def _facets(mesh: Mesh) -> npt.NDArray[np.float32]:
     """Return unit normal and three corners of the proper triangles, shape (k, 12)."""
-    from labapp.export.mesh_kernels import facets  # loads numba
+    from labapp.core.surface.kernels.mesh_kernels import facets  # loads numba
 
     return facets(mesh.vertices_mm, mesh.triangles)
 

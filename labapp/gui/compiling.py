@@ -22,7 +22,6 @@ COMPILED = (
     ),
     "labapp.core.sequence.prior",
     "labapp.export.fixed_point",
-    "labapp.export.mesh_kernels",
 )
 """Modules that compile (docs/adr/0018); those for the dots of a frame come first."""
 

@@ -34,7 +34,8 @@ been measured over 6 % too low, 69 exceed one of the two limits, and 3 of the ot
 `LEAST_FREE` dots without a ray; of 109 right frames with up to 12 false dots, 2."""
 
 SAME = 1e-9
-"""Places whose values deviate by less cannot be told apart: the dots fill the frame."""
+"""If the standard deviation of the places' values is less, the dots have nothing to be compared
+with: they fill the frame."""
 
 GRID = 30
 """Number of places along each side of the frame with which the dots are compared."""
