@@ -24,9 +24,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.line_pattern import LineRig, line_rig
 from labapp.core.geometry.rig import Rig
-from labapp.core.images.band_pass import DetectorTuning, quick_dots, tuned_dots
+from labapp.core.images.band_pass import quick_dots, tuned_dots
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
+from labapp.core.images.peaks import DetectorTuning
 from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.frame import LineFrame, measure_lines
 from labapp.core.match import Candidate, Match, RowsOpen

@@ -20,7 +20,7 @@ import platformdirs
 import typer
 from scipy.spatial import cKDTree
 
-from labapp.core.images.band_pass import DetectorTuning, band_pass_dots, quick_dots
+from labapp.core.images.band_pass import band_pass_dots, quick_dots, tuning_of
 from labapp.core.images.dots import Dots, Image
 from labapp.core.pipeline import Settings
 from labapp.core.values import FloatArray
@@ -107,7 +107,7 @@ def compare_detectors(video: Video, count: int) -> list[Detected | tuple[str, st
     with open_source(video.path) as source:
         images = [source.frame(number).image for number in frames]
     settings = Settings().dots.band_pass
-    tuning = DetectorTuning.of(images[0], settings)
+    tuning = tuning_of(images[0], settings)
 
     def quick(image: Image) -> FloatArray:
         dots: Dots = quick_dots(image, tuning, settings)

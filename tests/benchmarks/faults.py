@@ -91,14 +91,21 @@ def half_dark(image: GreyImage, rng: np.random.Generator) -> GreyImage:
     return _grey(image * (0.65 + 0.35 * dark))
 
 
-def bright_spots(image: GreyImage, rng: np.random.Generator) -> GreyImage:
-    """Add three reflections of the arc, 10 to 40 px wide."""
-    light = image.astype(float)
-    v, u = np.indices(image.shape)
-    for _ in range(3):
-        place, size = rng.random(2) * image.shape, rng.uniform(10.0, 40.0)
-        light += 150 * np.exp(-((v - place[0]) ** 2 + (u - place[1]) ** 2) / (2 * size**2))
-    return _grey(light)
+def arc_light(height: float, longer: float = 1.0) -> Spoil:
+    """Add three reflections of the arc, 10 to 40 px wide, that are longer by a factor."""
+
+    def spoil(image: GreyImage, rng: np.random.Generator) -> GreyImage:
+        light = image.astype(float)
+        v, u = np.indices(image.shape)
+        for _ in range(3):
+            place, size = rng.random(2) * image.shape, rng.uniform(10.0, 40.0)
+            angle = rng.uniform(0.0, np.pi)
+            along = (v - place[0]) * np.sin(angle) + (u - place[1]) * np.cos(angle)
+            across = (v - place[0]) * np.cos(angle) - (u - place[1]) * np.sin(angle)
+            light += height * np.exp(-((along / longer) ** 2 + across**2) / (2 * size**2))
+        return _grey(light)
+
+    return spoil
 
 
 def gratings(image: GreyImage, rng: np.random.Generator) -> GreyImage:
@@ -171,7 +178,7 @@ HIDING: dict[str, Hide] = {
 SPOILING: dict[str, Spoil] = {
     "none": lambda image, rng: image,
     "half-dark": half_dark,
-    "bright-spots": bright_spots,
+    "bright-spots": arc_light(150.0),
     "second-grid": gratings,
     "ghost": ghost,
     "wide-blur": wide_blur,
@@ -182,6 +189,8 @@ MOVED: dict[str, Spoil] = {"interlaced": interlaced, "flipped": flipped, "stretc
 """Their dots are not where the truth has them: only what is measured of the height is judged."""
 
 FAULTS = [*SPOILING, *HIDING, *MOVED]
+SPOILING |= {"saturated-spots": arc_light(500.0), "streaks": arc_light(200.0, longer=3.0)}
+FAULTS += ["saturated-spots", "streaks"]  # at the end: each fault's random numbers follow its place
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ import platformdirs
 from threadpoolctl import ThreadpoolController
 
 from labapp.config.setup import read_setup
-from labapp.core.images.band_pass import DetectorTuning
+from labapp.core.images.band_pass import tuning_of
 from labapp.core.images.dots import Image
 from labapp.core.pipeline import Settings, measure
 from labapp.core.recording.chain import WarmChain
@@ -72,7 +72,7 @@ def compare_dots(images: list[Image]) -> None:
 
     They take turns, as other programs and the memory allocated so far change the times of both.
     """
-    size_px = DetectorTuning.of(images[0], Settings().dots.band_pass).size_px
+    size_px = tuning_of(images[0], Settings().dots.band_pass).size_px
     (_, labapp_detector), (_, blobs) = islice(detectors(size_px), 2)
     assert not isinstance(labapp_detector, str)
     assert not isinstance(blobs, str)

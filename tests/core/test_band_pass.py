@@ -8,11 +8,11 @@ import pytest
 
 from labapp.core.images import dot_size
 from labapp.core.images.band_pass import (
-    DetectorTuning,
     _tuned,
     band_pass_dots,
     crowded_dots,
     dot_at,
+    tuning_of,
 )
 from labapp.core.images.dots import BandPassSettings, Dots
 from labapp.core.values import CannotMeasure, FloatArray
@@ -210,7 +210,7 @@ def test_frame_without_dots_raises_no_dots(frame: FloatArray) -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 400)])
 def test_frame_too_small_for_a_dot_is_rejected(shape: tuple[int, int]) -> None:
     frame, settings = np.random.default_rng(1).normal(size=shape), BandPassSettings()
-    for find in (crowded_dots, DetectorTuning.of):
+    for find in (crowded_dots, tuning_of):
         with pytest.raises(CannotMeasure) as error:
             find(frame, settings)
         assert error.value.status == "no-dots"

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from labapp.core.images.band_pass import PEAK_GAIN, DetectorTuning, band_pass_dots, quick_dots
+from labapp.core.images.band_pass import band_pass_dots, quick_dots, tuning_of
 from labapp.core.images.dots import BandPassSettings
+from labapp.core.images.peaks import PEAK_GAIN, DetectorTuning
 from labapp.core.values import CannotMeasure, FloatArray
 from tests.scenes import gaussian_dots
 
@@ -37,7 +38,7 @@ def places(rng: np.random.Generator) -> FloatArray:
 def test_quick_dots_agree_with_the_default_detector(seed: int) -> None:
     rng = np.random.default_rng(seed)
     first, true = frame(places(rng), rng), places(rng)
-    tuning = DetectorTuning.of(first, BandPassSettings())
+    tuning = tuning_of(first, BandPassSettings())
     after = frame(true, rng, hot=6)
     quick = quick_dots(after, tuning, BandPassSettings())
     full = band_pass_dots(after, BandPassSettings(size_px=tuning.size_px))
@@ -55,10 +56,10 @@ def test_local_and_full_background_give_the_same_dots(
 ) -> None:
     rng = np.random.default_rng(5)
     image = frame(places(rng), rng)
-    tuning = DetectorTuning.of(image, BandPassSettings())
+    tuning = tuning_of(image, BandPassSettings())
     results = []
     for limit in (np.inf, 0.0):
-        monkeypatch.setattr("labapp.core.images.band_pass.MOST_SURROUNDINGS", limit)
+        monkeypatch.setattr("labapp.core.images.peaks.MOST_SURROUNDINGS", limit)
         results.append(quick_dots(image, tuning, BandPassSettings()))
     np.testing.assert_allclose(results[0].image_px, results[1].image_px, atol=1e-4)
     np.testing.assert_allclose(results[0].size_px, results[1].size_px, atol=1e-3)
@@ -75,10 +76,10 @@ def test_search_of_a_part_finds_the_dots_of_the_full_search(
     first, faint = frame(group, rng), [255.0 + seed, 431.0 + seed]
     image = frame(group, rng, hot=6).astype(float)
     image += 12.0 * gaussian_dots(SHAPE, np.array([faint]), SIZE_PX)
-    tuning = DetectorTuning.of(first, BandPassSettings())
+    tuning = tuning_of(first, BandPassSettings())
     results = []
     for halved in (0.0, np.inf):
-        monkeypatch.setattr("labapp.core.images.band_pass.HALVED_PX", halved)
+        monkeypatch.setattr("labapp.core.images.peaks.HALVED_PX", halved)
         results += [quick_dots(each, tuning, BandPassSettings()) for each in (first, image)]
     for part, full in zip(results[:2], results[2:], strict=True):
         assert len(part) == len(full)
@@ -91,14 +92,14 @@ def test_quick_dots_of_the_tuning_frame_are_identical() -> None:
     rng = np.random.default_rng(9)
     image = frame(places(rng), rng, hot=6)
     cold = band_pass_dots(image, BandPassSettings())
-    quick = quick_dots(image, DetectorTuning.of(image, BandPassSettings()), BandPassSettings())
+    quick = quick_dots(image, tuning_of(image, BandPassSettings()), BandPassSettings())
     for one, other in zip(vars(cold).values(), vars(quick).values(), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 def test_frame_without_dots_raises_no_dots() -> None:
     rng = np.random.default_rng(5)
-    tuning = DetectorTuning.of(frame(places(rng), rng), BandPassSettings())
+    tuning = tuning_of(frame(places(rng), rng), BandPassSettings())
     for dark in (frame(np.zeros((0, 2)), rng, hot=4), np.zeros(SHAPE, np.uint8)):
         with pytest.raises(CannotMeasure) as error:
             quick_dots(dark, tuning, BandPassSettings())
@@ -106,7 +107,7 @@ def test_frame_without_dots_raises_no_dots() -> None:
 
 
 def test_frame_of_another_size_is_rejected() -> None:
-    tuning = DetectorTuning.of(np.zeros((40, 60), np.uint8), BandPassSettings(size_px=1.8))
+    tuning = tuning_of(np.zeros((40, 60), np.uint8), BandPassSettings(size_px=1.8))
     for kind in (np.uint8, np.uint16):
         with pytest.raises(ValueError, match="tuning of"):
             quick_dots(np.zeros((60, 40), kind), tuning, BandPassSettings(size_px=1.8))
@@ -116,7 +117,7 @@ def test_frame_of_another_size_is_rejected() -> None:
 def test_threads_can_share_a_tuning() -> None:
     rng = np.random.default_rng(11)
     frames = [frame(places(rng), rng) for _ in range(6)]
-    tuning, settings = DetectorTuning.of(frames[0], BandPassSettings()), BandPassSettings()
+    tuning, settings = tuning_of(frames[0], BandPassSettings()), BandPassSettings()
     alone = [quick_dots(image, tuning, settings).image_px for image in frames]
     with ThreadPoolExecutor(3) as pool:
         results = list(
@@ -130,7 +131,7 @@ def test_threads_can_share_a_tuning() -> None:
 def test_only_peaks_over_the_threshold_are_dots(size_px: float) -> None:
     rng = np.random.default_rng(12)
     image, settings = frame(places(rng), rng), BandPassSettings(size_px=size_px)
-    tuning = DetectorTuning.of(image, settings)
+    tuning = tuning_of(image, settings)
     brightest = PEAK_GAIN * float(quick_dots(image, tuning, settings).peak.max())
     below = replace(tuning, least=0.95 * brightest)
     assert (PEAK_GAIN * quick_dots(image, below, settings).peak > 0.95 * brightest).all()

@@ -14,8 +14,9 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
-from labapp.core.images.band_pass import DetectorTuning, quick_dots
+from labapp.core.images.band_pass import quick_dots
 from labapp.core.images.dots import BandPassSettings, Dots, Image
+from labapp.core.images.peaks import DetectorTuning
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.recording.chain import WarmChain
 from labapp.core.values import FloatArray

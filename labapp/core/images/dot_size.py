@@ -58,6 +58,10 @@ LEAST_SHARP, WIDER = 50, 0.7
 """Least number of such blobs; least median ratio of their responses at the next scale and at the
 smallest. It is 0.5 for single pixels and 0.9 for Gaussian dots of the smallest scale."""
 
+LEAST_DOTS = 9
+"""Least number of blobs at the dots' scale and the next ones, unless no scale has as many: a few
+reflections of the arc may be brighter and larger than all dots together."""
+
 BEST = 0.884
 """Scale of the band with the largest response to a Gaussian dot, over the dot's size: about
 1/√(NARROW · WIDE)."""
@@ -124,6 +128,10 @@ def _size_from(picture: Picture, level: float, finest: int) -> float | None:
                 WHOLE,
             )
     votes = np.array([SCALES_PX[some.scale] * some.own[some.votes].sum() for some in kinds])
+    counts = np.pad([np.count_nonzero(some.votes) for some in kinds], 1)
+    is_few = counts[:-2] + counts[1:-1] + counts[2:] < LEAST_DOTS
+    if not is_few.all():
+        votes[is_few] = 0.0
     if finest == 0:
         if votes[0] > SHARP * votes[1:].sum() and _are_dots(kinds[0]):
             return float(SCALES_PX[0] / BEST)

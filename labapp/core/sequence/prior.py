@@ -10,7 +10,7 @@ from numba import types
 
 from labapp.core.compiled import compiled
 from labapp.core.geometry.bench import Bench
-from labapp.core.images.band_pass import DetectorTuning
+from labapp.core.images.peaks import DetectorTuning
 from labapp.core.match import Match
 from labapp.core.matching.prediction import RayPaths
 from labapp.core.schemes.fit import UNSETTLED_MM, FromPrevious, SetupPart, parts_after

@@ -32,7 +32,7 @@ reason the factor of the fit is not used, which followed frames reuse while poin
 NEWTON_STEPS = 8
 """Newton steps from the landing point of a ray on the work piece to the surface."""
 
-REACH = 0.6
+REACH = 0.4
 """Reach of the search for the level (`find_level`) around that of the unperturbed surface."""
 
 

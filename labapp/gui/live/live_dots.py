@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.images.band_pass import DetectorTuning, quick_dots
+from labapp.core.images.band_pass import quick_dots, tuning_of
 from labapp.core.images.dots import Dots
 from labapp.core.images.exposure import Exposure, judge_exposure
 from labapp.core.images.find_dots import DotSettings, find_dots
+from labapp.core.images.peaks import DetectorTuning
 from labapp.core.pipeline import Measurement
 from labapp.core.quality import UNMEASURED, Quality, judge_quality
 from labapp.core.values import CannotMeasure, FloatArray
@@ -91,7 +92,7 @@ class LiveDots:
         """Return the tuning for a frame; estimated anew if it is old or does not fit."""
         light, now_s = self._light, time.monotonic()
         if light is None or now_s > light.until_s or not light.fits(settings, image):
-            tuning = DetectorTuning.of(image, settings.band_pass)
+            tuning = tuning_of(image, settings.band_pass)
             light = self._light = _Light(settings, tuning, now_s + LIGHT_S)
         return light.tuning
 

@@ -15,7 +15,7 @@ from labapp.core.matching.hypothesis import MISSED_COST, Hypothesis, evaluate_av
 from labapp.core.matching.label_growth import grow_labels
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.surface.pool_fit import FitSettings
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, median
 
 FEW, MOST_FREED = 4, 8
 """If at most the second number of dots are beyond a hidden row, they lose their rays; otherwise the
@@ -144,11 +144,8 @@ def _wide_gaps(observed: Observation, labels: IntArray) -> Iterator[tuple[int, i
 
 def _gaps(place: FloatArray) -> FloatArray:
     """Median distance of the dots of each row from those of the next one, NaN without any."""
-    distance = np.linalg.norm(np.diff(place, axis=0), axis=-1)
-    gaps = np.full(len(distance), np.nan)
-    known = np.isfinite(distance).any(axis=1)
-    gaps[known] = np.nanmedian(distance[known], axis=1)
-    return gaps
+    step = np.diff(place, axis=0)
+    return np.array([median(row[np.isfinite(row)]) for row in np.hypot(step[..., 0], step[..., 1])])
 
 
 def _moved_outwards(labels: IntArray, axis: int, inner: int, outer: int) -> IntArray | None:
