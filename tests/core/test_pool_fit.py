@@ -23,6 +23,7 @@ from labapp.core.schemes import fit
 from labapp.core.surface.level import KnownRays, Level, LevelSearch, Rear
 from labapp.core.surface.measures import WITH_SIGMA
 from labapp.core.surface.pool_fit import (
+    REUSE_FLOORS,
     FitSettings,
     FittedPool,
     basis_around,
@@ -363,26 +364,42 @@ def test_lengths_of_pools_with_a_low_rear_are_within_twice_their_uncertainty(tra
     assert np.sqrt(np.mean(np.square(deviations))) < 2.2
 
 
-def test_held_drop_keeps_its_uncertainty(match: Match) -> None:
-    rays, at, settings = (
-        project_rays(OPEN_RIG.laser, OPEN_RIG.pattern),
-        match.ray.T - 1,
-        FitSettings(),
-    )
-    points = rays.landing_mm[tuple(at)]
+def rounds_of(match: Match) -> Rounds:
+    """Return rounds of a fit to a match that begin at z = 0."""
+    rays, at = project_rays(OPEN_RIG.laser, OPEN_RIG.pattern), tuple(match.ray.T - 1)
+    points, settings = rays.landing_mm[at], FitSettings()
     basis = basis_around(points[:, :2], rays, settings.knot_mm)
     seen = match.plane_mm, match.plane_covariance_mm2
     equations = normal_equations(basis, OPEN_RIG, points, *seen, settings)
-    known_rays = KnownRays.of(OPEN_RIG, match.ray_states, basis, 0.0)
+    equations.reuse_mm = REUSE_FLOORS * settings.floor_mm
+    return Rounds(equations, rays.directions[at], np.zeros(basis.count), points, np.inf)
+
+
+def known_rays_of(match: Match, rounds: Rounds) -> KnownRays:
+    return KnownRays.of(OPEN_RIG, match.ray_states, rounds.equations.basis, match.missing)
+
+
+def test_fit_consists_of_rounds_with_their_level(match: Match) -> None:
+    rounds, settings = rounds_of(match), FitSettings()
+    search = LevelSearch(known_rays_of(match, rounds))
+    level = rounds.run(settings.rounds, settings.settled_mm, search=search)
+    pool = fitted(match)
+    np.testing.assert_allclose(pool.surface.coefficients, rounds.coefficients, atol=1e-9)
+    np.testing.assert_allclose(pool.factor, rounds.equations.factor, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(pool.points_mm, rounds.points_mm, atol=1e-8)
+    assert pool.level.shift_mm == pytest.approx(level.shift_mm, abs=1e-9)
+    assert pool.level.sigma_mm == pytest.approx(level.sigma_mm, rel=1e-6)
+
+
+def test_held_drop_keeps_its_uncertainty(match: Match) -> None:
     held = replace(
         fitted(match).level, sigma_mm=0.02, drop_sigma_mm=0.03, drop_covariance_mm2=-3e-4
     )
     found = {}
     for is_free in True, False:
-        rounds = Rounds(
-            equations, rays.directions[tuple(at)], np.zeros(basis.count), points, np.inf
-        )
-        found[is_free] = rounds.run(3, 0.0, search=LevelSearch(known_rays, held, is_free))
+        rounds = rounds_of(match)
+        search = LevelSearch(known_rays_of(match, rounds), held, is_free)
+        found[is_free] = rounds.run(3, 0.0, search=search)
     assert (found[False].drop_sigma_mm, found[False].drop_covariance_mm2) == (0.03, -3e-4)
     assert found[False].sigma_mm == 0.02
     assert found[True].drop_sigma_mm < 0.02

@@ -240,24 +240,20 @@ class LevelSearch:
         While it is fixed, the uncertainty of the level is not reduced.
     level_settled_mm
         After a shift of the surface by less, the level is not determined again.
-    outer
-        Mask of the reflection points far from their centre, shape (n,), from which the level is
-        guessed if no ray is dark (`level_kernels.guess_level`). None: it is not guessed.
     """
 
     known_rays: KnownRays
     near: Level | None = None
     drop_is_free: bool = True
     level_settled_mm: float = 0.0
-    outer: BoolArray | None = None
 
     @cached_property
     def for_kernel(self) -> tuple[_LevelInput, FloatArray, tuple[float, float, bool, bool, float]]:
         """The level's arguments of `rounds_kernels.run_rounds`, and the last five limits."""
-        known_rays, near, outer = self.known_rays, self.near, self.outer
+        known_rays, near = self.known_rays, self.near
         sigma = known_rays.height_sigma_mm
         level_input = (
-            np.empty(0, bool) if outer is None else outer,
+            np.empty(0, bool),
             known_rays.landing_mm,
             known_rays.ray_states,
             np.zeros(len(known_rays.ray_states)) if sigma is None else sigma,

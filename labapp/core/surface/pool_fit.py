@@ -26,6 +26,7 @@ from labapp.core.match import Match, MatchedDots
 from labapp.core.surface.level import KnownRays, Level, LevelSearch
 from labapp.core.surface.solver import (
     NEWTON_STEPS,
+    NO_SURFACE,
     NormalEquations,
     Rounds,
     height_sigma,
@@ -153,35 +154,50 @@ def fit_pool(
     CannotMeasure
         ``no-surface`` if no surface can be fitted or it sends rays away from the plane.
     """
-    from labapp.core.surface.kernels import ray_kernels, solver_kernels
+    from labapp.core.surface.kernels import fit_kernels
 
     rays = project_rays(rig.laser, rig.pattern)
-    directions, points, is_outer = ray_kernels.rays_of_pairs(
-        match.ray, rays.directions, rays.landing_mm
-    )
+    places = rays.landing_mm[tuple(match.ray.T - 1)][:, :2]
     # Before the splines are made: labels that hardly fit may spread over kilometres.
-    size_mm = np.ptp(points[:, :2], axis=0) + 2 * _margin_mm(rays)
-    if not np.prod(np.ceil(size_mm / settings.knot_mm) + DEGREE) <= MOST_SPLINES:
-        width, length = size_mm
+    low, high = _ends_around(places, rays)
+    if not (np.ceil((high - low) / settings.knot_mm) + DEGREE).prod() <= MOST_SPLINES:
+        width, length = high - low
         raise CannotMeasure("no-surface", f"lit rays spread over {width:.0f} × {length:.0f} mm")
-    basis = basis_around(points[:, :2], rays, settings.knot_mm)
-    equations = normal_equations(
-        basis, rig, points, match.plane_mm, match.plane_covariance_mm2, settings
+    basis = SplineBasis.over(low, high, settings.knot_mm)
+    coefficients, points, factor, found, residual, moved = fit_kernels.fit_pairs(
+        (basis.grid, basis.roughness_matrix),
+        match.ray,
+        (rays.directions, rays.landing_mm),
+        (match.plane_mm, match.plane_covariance_mm2),
+        (rig.laser.position_mm, rig.imaging_plane.pose_mm),
+        _near(initial),
+        match.ray_states,
+        _limits(settings, rays, rig.head_sign, match.missing),
     )
-    equations.reuse_mm = REUSE_FLOORS * settings.floor_mm
-    if initial is not None:
-        points, _ = solver_kernels.newton_along_rays(
-            initial.basis.grid, initial.coefficients, directions, points, NEWTON_STEPS
-        )
-    rounds = Rounds(equations, directions, np.zeros(basis.count), points, np.inf)
+    if np.isnan(moved):
+        raise CannotMeasure("no-surface", NO_SURFACE)
+    surface, level = SplineSurface(basis, coefficients), Level.of(found)
+    pool = FittedPool(surface, factor, level, points, residual, moved)
+    return _weighed(pool, match, rig, settings) if weigh_by_height_sigma else _on_plane(pool)
+
+
+def _weighed(
+    pool: FittedPool, match: Match | MatchedDots, rig: Rig, settings: FitSettings
+) -> FittedPool:
+    """Continue a fit, with less weight for the level of rays where the surface is uncertain."""
+    rays, at, basis = project_rays(rig.laser, rig.pattern), match.ray.T - 1, pool.surface.basis
     known_rays = KnownRays.of(rig, match.ray_states, basis, match.missing)
-    outer = None if (known_rays.ray_states < 0).any() else is_outer
-    most, until_mm = settings.rounds, settings.settled_mm
-    level = rounds.run(most, until_mm, search=LevelSearch(known_rays, outer=outer))
-    if weigh_by_height_sigma and outer is None:
-        sigma = rounds.height_sigma_mm(known_rays.landing_mm)
-        known_rays = replace(known_rays, height_sigma_mm=sigma)
-        level = rounds.run(most, until_mm, search=LevelSearch(known_rays, level))
+    if not (known_rays.ray_states < 0).any():
+        return _on_plane(pool)
+    landing, directions = rays.landing_mm[tuple(at)], rays.directions[tuple(at)]
+    seen = match.plane_mm, match.plane_covariance_mm2
+    equations = normal_equations(basis, rig, landing, *seen, settings)
+    equations.factor, equations.reuse_mm = pool.factor, REUSE_FLOORS * settings.floor_mm
+    state = pool.surface.coefficients, pool.points_mm, pool.unsettled_mm
+    rounds = Rounds(equations, directions, *state)
+    sigma = rounds.height_sigma_mm(known_rays.landing_mm)
+    search = LevelSearch(replace(known_rays, height_sigma_mm=sigma), pool.level)
+    level = rounds.run(settings.rounds, settings.settled_mm, search=search)
     return fitted_pool(rounds, level, rig, match.plane_mm)
 
 
@@ -217,19 +233,39 @@ def misfits(
     """
     from labapp.core.surface.kernels import fit_kernels
 
-    rays, flat = project_rays(rig.laser, rig.pattern), (np.empty((2, 4)), np.empty(0))
-    weight, reuse_mm = _roughness_weight(settings), REUSE_FLOORS * settings.floor_mm
-    fit = MOST_SPLINES, _margin_mm(rays), settings.knot_mm, weight, settings.floor_mm
-    rounds = settings.rounds, settings.settled_mm, NEWTON_STEPS, reuse_mm
+    rays = project_rays(rig.laser, rig.pattern)
+    sizes = least, MOST_SPLINES, _margin_mm(rays), settings.knot_mm
     return fit_kernels.misfits(
         labelled,
         (rays.directions, rays.landing_mm),
         (plane_mm, plane_covariance_mm2),
         (rig.laser.position_mm, rig.imaging_plane.pose_mm),
-        flat if initial is None else (initial.basis.grid, initial.coefficients),
+        _near(initial),
         cell_products(),
-        np.array([least, *fit, *rounds], float),
+        np.array([*sizes, *_limits(settings, rays, rig.head_sign)]),
     )
+
+
+def _near(initial: SplineSurface | None) -> tuple[FloatArray, FloatArray]:
+    """Grid and coefficients of the surface to start from; no coefficients for z = 0."""
+    if initial is None:
+        return np.empty((2, 4)), np.empty(0)
+    return initial.basis.grid, initial.coefficients
+
+
+def _limits(
+    settings: FitSettings, rays: ProjectedRays, head_sign: int, missing: float = 0.0
+) -> FloatArray:
+    """Limits of `fit_kernels.fit_pairs`."""
+    fit = _roughness_weight(settings), settings.floor_mm, *rays.spacing_mm.tolist()
+    rounds = (
+        settings.rounds,
+        settings.settled_mm,
+        NEWTON_STEPS,
+        REUSE_FLOORS * settings.floor_mm,
+        np.nan,
+    )
+    return np.array([*fit, *rounds, head_sign, missing, 1.0, 0.0, 0.0])
 
 
 def normal_equations(
@@ -269,19 +305,25 @@ def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) ->
     points, _, computed = ray_kernels.intersect_and_reflect(
         basis.grid, rounds.coefficients, rounds.rays, rounds.points_mm, 1, plane
     )
-    residual = computed - plane_mm
-    if not np.isfinite(residual).all():
-        raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")
     assert rounds.equations.factor is not None
-    return FittedPool(
-        surface=SplineSurface(basis, rounds.coefficients),
-        factor=rounds.equations.factor,
-        level=level,
-        points_mm=points,
-        residual_mm=residual,
-        unsettled_mm=rounds.moved_mm,
-        inverse=rounds.equations.known_inverse,
+    return _on_plane(
+        FittedPool(
+            surface=SplineSurface(basis, rounds.coefficients),
+            factor=rounds.equations.factor,
+            level=level,
+            points_mm=points,
+            residual_mm=computed - plane_mm,
+            unsettled_mm=rounds.moved_mm,
+            inverse=rounds.equations.known_inverse,
+        )
     )
+
+
+def _on_plane(pool: FittedPool) -> FittedPool:
+    """Return a fit that sends all its rays to the plane; raise ``no-surface`` if it does not."""
+    if not np.isfinite(pool.residual_mm).all():
+        raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")
+    return pool
 
 
 def basis_around(places_mm: FloatArray, rays: ProjectedRays, knot_mm: float) -> SplineBasis:
@@ -296,9 +338,13 @@ def basis_around(places_mm: FloatArray, rays: ProjectedRays, knot_mm: float) -> 
     knot_mm
         Spacing of the spline knots, mm.
     """
+    return SplineBasis.over(*_ends_around(places_mm, rays), knot_mm)
+
+
+def _ends_around(places_mm: FloatArray, rays: ProjectedRays) -> tuple[FloatArray, FloatArray]:
+    """Low and high ends of the splines over places, shape (n, 2), with a margin; shape (2,), mm."""
     margin = _margin_mm(rays)
-    low, high = places_mm.min(axis=0) - margin, places_mm.max(axis=0) + margin
-    return SplineBasis.over(low, high, knot_mm)
+    return places_mm.min(axis=0) - margin, places_mm.max(axis=0) + margin
 
 
 def _margin_mm(rays: ProjectedRays) -> float:
