@@ -406,6 +406,7 @@ def load_all() -> None:
     import labapp.core.images.centroid_kernels
     import labapp.core.images.size_kernels
     import labapp.core.matching.initial.quadric_kernels
+    import labapp.core.matching.label_growth_kernels
     import labapp.core.matching.match_kernels
     import labapp.core.recording.chain
     import labapp.core.recording.row_vote

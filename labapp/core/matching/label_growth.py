@@ -19,9 +19,8 @@ from labapp.core.matching.observation import (
     count_labels,
     neighbours_of,
     try_fit,
-    within_rings,
 )
-from labapp.core.matching.prediction import predict, sure_pairs
+from labapp.core.matching.prediction import NEWTON_STEPS, sure_limits
 from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.values import IntArray, median
 
@@ -129,18 +128,17 @@ def matched_labels(observed: Observation, pool: FittedPool, labels: IntArray) ->
     rivals: where the prediction is so uncertain that a dot could belong to the next row but one,
     it stays unlabelled.
     """
-    matched = np.full(labels.shape, UNLABELLED, np.int64)
-    far = predict(observed, pool, within_rings(labels, 2))
-    if len(far.at) == 0:
-        return matched
-    dots, covariance = np.arange(len(observed.plane_mm)), far.covariance_mm2(pool, observed.rig)
-    dot, ray = sure_pairs(observed, dots, far.plane_mm, covariance)
-    at = far.at[ray]
-    taken = within_rings(labels, 1)[at[:, 0], at[:, 1]] & ~observed.rays.absent[at[:, 0], at[:, 1]]
-    # The positions of dots that merge are not those of either ray.
-    taken &= far.spacing_mm[ray] > observed.resolution_mm
-    matched[at[taken, 0], at[taken, 1]] = dot[taken]
-    return matched
+    from labapp.core.matching import label_growth_kernels
+
+    rays, rig, surface = observed.rays, observed.rig, pool.surface
+    return label_growth_kernels.matched_labels(
+        labels,
+        (rays.directions, rays.landing_mm, rays.absent),
+        (rig.laser.position_mm, rig.imaging_plane.pose_mm),
+        (surface.basis.grid, surface.coefficients, pool.factor),
+        (observed.plane_mm, observed.covariance_mm2),
+        np.array([NEWTON_STEPS, observed.resolution_mm, *sure_limits()]),
+    )
 
 
 def _without_far_labels(observed: Observation, labels: IntArray, settings: FitSettings) -> IntArray:

@@ -168,23 +168,20 @@ def sure_pairs(
     """
     from labapp.core.matching import match_kernels
 
-    limits = np.array(
-        [
-            SIGMA_INFLATION**2,  # inflation
-            MODEL_ERROR_MM**2,  # error
-            GATE_SIGMA2,  # gate
-            RIVAL_MARGIN,  # margin
-            false_dot_deviance(),  # false
-        ]
-    )
     dot, ray = match_kernels.sure_pairs(
         observed.plane_mm[dots],
         observed.covariance_mm2[dots],
         plane_mm,
         covariance_mm2,
-        limits,
+        sure_limits(),
     )
     return dots[dot], ray
+
+
+def sure_limits() -> FloatArray:
+    """Limits of `match_kernels.sure_pairs`."""
+    inflation, error = SIGMA_INFLATION**2, MODEL_ERROR_MM**2
+    return np.array([inflation, error, GATE_SIGMA2, RIVAL_MARGIN, false_dot_deviance()])
 
 
 def pair_deviances(
