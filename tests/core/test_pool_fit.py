@@ -392,17 +392,21 @@ def test_fit_consists_of_rounds_with_their_level(match: Match) -> None:
 
 
 def test_held_drop_keeps_its_uncertainty(match: Match) -> None:
-    held = replace(
-        fitted(match).level, sigma_mm=0.02, drop_sigma_mm=0.03, drop_covariance_mm2=-3e-4
+    certain = replace(
+        fitted(match).level, sigma_mm=0.05, drop_sigma_mm=0.0, drop_covariance_mm2=0.0
     )
-    found = {}
-    for is_free in True, False:
+    uncertain = replace(certain, drop_sigma_mm=0.03, drop_covariance_mm2=-3e-4)
+
+    def found(held: Level, is_free: bool) -> Level:
         rounds = rounds_of(match)
         search = LevelSearch(known_rays_of(match, rounds), held, is_free)
-        found[is_free] = rounds.run(3, 0.0, search=search)
-    assert (found[False].drop_sigma_mm, found[False].drop_covariance_mm2) == (0.03, -3e-4)
-    assert found[False].sigma_mm == 0.02
-    assert found[True].drop_sigma_mm < 0.02
+        return rounds.run(3, 0.0, search=search)
+
+    kept, of_rays = found(uncertain, False), found(certain, False).sigma_mm
+    assert (kept.drop_sigma_mm, kept.drop_covariance_mm2) == (0.03, -3e-4)
+    assert kept.sigma_mm == pytest.approx(np.hypot(of_rays, 3e-4 / 0.03), rel=0.01)
+    assert of_rays < 0.02  # these rays show the level better than those of the frame before
+    assert found(uncertain, True).drop_sigma_mm < 0.02
 
 
 def test_uncertainty_of_shift_and_drop_agrees_with_samples() -> None:

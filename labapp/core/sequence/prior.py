@@ -75,8 +75,6 @@ class Prior:
     past, slopes
         Spline coefficients of the last frames, newest last, shape (frames, p), mm, and the slopes
         of those surfaces at the reflection points, shape (frames, R, 2).
-    level_sigma_mm
-        Uncertainty of the level when the drop of the rear was last fitted with it, mm.
     setup_parts
         Parts of the set-up in the uncertainty of sizes, each with the sizes for which it was
         computed: the sizes of a pool that oscillates recur.
@@ -94,7 +92,6 @@ class Prior:
     level: Level
     past: FloatArray
     slopes: FloatArray
-    level_sigma_mm: float
     setup_parts: tuple[SetupPart, ...]
     unseen: int = 0
     count: int = 0
@@ -111,7 +108,7 @@ class Prior:
     ) -> Prior:
         """Build the prior from a frame that was matched without one."""
         basis, coefficients = pool.surface.basis, pool.surface.coefficients
-        paths, level = RayPaths.of(bench, basis, coefficients), replace(pool.level, shift_mm=0.0)
+        paths = RayPaths.of(bench, basis, coefficients)
         return cls(
             tuning=tuning,
             cold_match=match,
@@ -120,10 +117,9 @@ class Prior:
             paths=paths,
             lit=match.ray_states > 0,
             boundary=reconstruction.boundary,
-            level=level,
+            level=pool.level,
             past=coefficients[None],
             slopes=paths.slopes[None],
-            level_sigma_mm=level.sigma_mm,
             setup_parts=(SetupPart(reconstruction.size_sigma_setup, measures.sizes),),
         )
 
@@ -139,7 +135,6 @@ class Prior:
             level=pool.level,
             past=np.vstack([self.past[1 - MEMORY :], paths.coefficients]),
             slopes=np.concatenate([self.slopes[1 - MEMORY :], paths.slopes[None]]),
-            level_sigma_mm=pool.level.sigma_mm if self.drop_is_free else self.level_sigma_mm,
             setup_parts=parts_after(self.setup_parts, of_setup, measures.sizes),
             unseen=0 if tracked.reference_is_seen else self.unseen + 1,
             count=self.count + 1,

@@ -409,7 +409,7 @@ def _with_level(
     known_rays = KnownRays.of(observed.rig, ray_states, prior.basis, missing)
     sigma = fit.rounds.height_sigma_mm(known_rays.landing_mm)
     known_rays = replace(known_rays, height_sigma_mm=sigma)
-    near = replace(prior.level, shift_mm=0.0, sigma_mm=prior.level_sigma_mm)
+    near = replace(prior.level, shift_mm=0.0)
     search = LevelSearch(known_rays, near, prior.drop_is_free, RAISED_MM)
     level = fit.rounds.run(fit.settings.rounds, SETTLED_MM, search=search)
     fit.check_settled()

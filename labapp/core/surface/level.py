@@ -237,7 +237,7 @@ class LevelSearch:
         Initial estimate of the level for the first search. None: all levels are tried.
     drop_is_free
         Whether the drop of the rear is found along with the level, in the first half of the rounds.
-        While it is fixed, the uncertainty of the level is not reduced.
+        While it is fixed, its part of the uncertainty of the level stays the same.
     level_settled_mm
         After a shift of the surface by less, the level is not determined again.
     """

@@ -57,7 +57,9 @@ def _level_of_round(
     seen = height, there[1:].T, landing, ray_states, spacing
     found = find_level(*seen, bench, about, missing)
     if is_held:
-        found[1], found[9:] = max(found[1], level[1]), level[9:]
+        if level[9] > 0.0:  # the part that is due to the uncertainty of the drop stays
+            found[1] = np.hypot(found[1], level[10] / level[9])
+        found[9:] = level[9:]
     return found
 
 
