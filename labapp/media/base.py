@@ -28,6 +28,16 @@ class Frame(ReadOnlyArrays):
     image: GreyImage
     """Grey levels, shape (rows, columns), read-only."""
 
+    def repeats(self, before: Frame) -> bool:
+        """Whether it has the pixels of the frame before it, which are not all of one level.
+
+        Noise differs from frame to frame: a camera or program has added such a frame, often in
+        place of a lost one, and it shows the pool of another time than its own. Without a time
+        base this does not matter.
+        """
+        is_next = self.time_s is not None and self.index == before.index + 1
+        return is_next and np.array_equal(self.image, before.image) and bool(np.ptp(self.image))
+
 
 class FrameSource(Protocol):
     """Frames in a fixed order, each of the same shape: a video, an image, a folder of images."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.errors import InputError
-from labapp.media.base import FrameSource, GreyImage
+from labapp.media.base import Frame, FrameSource, GreyImage
 
 if TYPE_CHECKING:
     from labapp.media.formats.video import VideoSource
@@ -48,6 +48,17 @@ def frame_checksum(image: GreyImage) -> int:
     return zlib.crc32(little.tobytes())
 
 
+def repeated_words(numbers: Sequence[int]) -> str:
+    """Warn of frames that repeat the one before, in a sentence; empty without any."""
+    if not numbers:
+        return ""
+    frames = "frames" if len(numbers) > 1 else "a frame"
+    return (
+        f"{frames} with the pixels of the one before: {_named(numbers)}; "
+        "unless they replace lost frames, the times after them are wrong, and so are frequencies"
+    )
+
+
 def survey(source: FrameSource, progress: Callable[[int, int], None] | None = None) -> Survey:
     """Read all frames in order, then some out of order from the reopened source.
 
@@ -64,7 +75,8 @@ def survey(source: FrameSource, progress: Callable[[int, int], None] | None = No
     checksum = np.zeros(len(source), np.uint32)
     readable = np.zeros(len(source), bool)
     time_s = np.full(len(source), np.nan)
-    first_reason = ""
+    first_reason, repeated = "", list[int]()
+    before: Frame | None = None
     for index in range(len(source)):
         try:
             frame = source.frame(index)
@@ -74,6 +86,9 @@ def survey(source: FrameSource, progress: Callable[[int, int], None] | None = No
             readable[index] = True
             checksum[index] = frame_checksum(frame.image)
             time_s[index] = np.nan if frame.time_s is None else frame.time_s
+            if before is not None and frame.repeats(before):
+                repeated.append(index)
+            before = frame
         if progress is not None:
             progress(index + 1, total)
     exact = True
@@ -86,7 +101,8 @@ def survey(source: FrameSource, progress: Callable[[int, int], None] | None = No
             exact &= bool(same)
             if progress is not None:
                 progress(len(source) + count, total)
-    warnings = (*_unread(readable, first_reason), *_inexact(source, exact))
+    found = (_unread(readable, first_reason), repeated_words(repeated), *_inexact(source, exact))
+    warnings = tuple(filter(None, found))
     return Survey(checksum, readable, time_s, exact, len(order), warnings)
 
 
@@ -101,12 +117,16 @@ def _order(source: FrameSource) -> list[int]:
     return [last, 0, *drawn, *sorted({max(0, k - 1) for k in drawn[:4]}, reverse=True)]
 
 
-def _unread(readable: npt.NDArray[np.bool_], first_reason: str) -> tuple[str, ...]:
+def _unread(readable: npt.NDArray[np.bool_], first_reason: str) -> str:
     numbers = np.flatnonzero(~readable).tolist()
     if not numbers:
-        return ()
-    named = ", ".join(map(str, numbers[:NAMED_FRAMES])) + " …" * (len(numbers) > NAMED_FRAMES)
-    return (f"{len(numbers)} of {len(readable)} frames cannot be read: {named} ({first_reason})",)
+        return ""
+    count = f"{len(numbers)} of {len(readable)} frames"
+    return f"{count} cannot be read: {_named(numbers)} ({first_reason})"
+
+
+def _named(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers[:NAMED_FRAMES])) + " …" * (len(numbers) > NAMED_FRAMES)
 
 
 def _inexact(source: FrameSource, exact: bool) -> tuple[str, ...]:

@@ -49,6 +49,16 @@ def test_every_frame_is_read_once_and_some_again(
     assert steps == [(done, total) for done in range(1, total + 1)]
 
 
+def test_repeated_frames_are_named(
+    tmp_path: Path, pictures: Pictures, write_video: WriteVideo
+) -> None:
+    shown = [*pictures[:3], pictures[2], pictures[3], pictures[3], pictures[3]]
+    dark = [np.zeros_like(pictures[0])] * 2
+    with VideoSource(write_video(tmp_path / "v.avi", shown + dark, "FFV1")) as source:
+        (warning,) = survey(source).warnings
+    assert re.findall(r"\d+", warning) == ["3", "5", "6"]
+
+
 def test_checksum_is_of_the_levels_in_little_endian_order() -> None:
     image = np.array([[1, 2], [3, 0x1234]], np.uint16)
     assert frame_checksum(image) == zlib.crc32(bytes([1, 0, 2, 0, 3, 0, 0x34, 0x12]))
