@@ -19,6 +19,7 @@ from labapp.core.images.dots import BandPassSettings, Dots, Image
 from labapp.core.images.peaks import DetectorTuning
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.recording.chain import WarmChain
+from labapp.core.sequence.prior import DROP_EVERY
 from labapp.core.values import FloatArray
 from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import LowRear, Wave, egg
@@ -134,6 +135,24 @@ def test_uncertain_depth_of_the_rear_counts_in_followed_frames() -> None:
     sigma = first.measures.length_sigma_level_mm
     assert sigma > 1.5 * first.measures.width_sigma_level_mm
     assert followed.measures.length_sigma_level_mm == pytest.approx(sigma, rel=0.3)
+
+
+@pytest.mark.parametrize("ray", [(9, 16), (9, 2)])
+def test_missing_dot_at_the_rim_is_not_taken_for_a_low_rear(ray: tuple[int, int]) -> None:
+    pool = egg(6.0, 3.0, 3.0, 0.3)
+    recording = Recording(
+        file="recording.avi", rig=RIG, view=VIEW, look=Look(), pools=(pool, pool), seed=62
+    )
+    _, prior = measure(recording.frame(0).image, BENCH, Settings())
+    assert prior is not None
+    frame = recording.frame(1)
+    image = without_dots(frame.image, frame.dot_px[ray][None])
+    found, after = measure(image, BENCH, Settings(), replace(prior, count=DROP_EVERY - 1))
+    assert found.measures is not None
+    assert after is not None
+    assert after.level.rear.drop_mm == 0.0
+    error = found.measures.height_mm - pool.size.height_mm
+    assert abs(error) < 2 * found.measures.height_sigma_mm
 
 
 @pytest.mark.parametrize("number", [2, 9])

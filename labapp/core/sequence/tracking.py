@@ -403,6 +403,10 @@ def _with_level(
     observed, paths = fit.observed, fit.paths()
     found = classify_rays(observed, fit.labels, paths)
     ray_states = certain_states(observed, found.ray_states, paths, lambda some: covariance[some])
+    if prior.drop_is_free:
+        # A missing dot at the rim would be taken for a lower rear. In other frames such rays count
+        # as dark: where the rim moves, they tell how far.
+        ray_states[prior.lit & (ray_states < 0)] = 0
     if not boundary_is_seen(ray_states):
         raise TrackLost(BOUNDARY_UNSEEN)
     missing = missing_share(len(found.missed), len(fit.lit_rays))
