@@ -242,7 +242,8 @@ class Documents:
         for kind in PICTURED:
             with suppress(InputError):  # `problems` reports it
                 document = self.get(kind)
-                for one in getattr(document, "pictures", (document,)):
+                parts = getattr(document, "pictures", (document,))
+                for one in (*parts, getattr(document, "cross", None)):
                     if sha256 := getattr(one, "picture_sha256", None):
                         found[sha256] = kind
                     found |= dict.fromkeys(getattr(one, "further_sha256", ()), kind)

@@ -69,6 +69,19 @@ class LaserReadings:
 
 
 @dataclass(frozen=True)
+class CrossPicture:
+    """A picture of the laser's cross, and the points that the operator places in it."""
+
+    picture_sha256: str
+    """The picture in the session."""
+    places_px: tuple[tuple[float, float], ...]
+    """(u, v) of the ends of the cross on the laser's side, opposite, left and right, and of both
+    points of the scale, px."""
+    scale_mm: float
+    """Distance between the points of the scale, mm."""
+
+
+@dataclass(frozen=True)
 class LaserEntries:
     """Readings of the laser's cross as the operator entered them, not applied yet."""
 
@@ -80,6 +93,8 @@ class LaserEntries:
     """Fan angle, its standard uncertainty and step of the callipers, as in `LaserReadings`."""
     picture_sha256: str | None = None
     """The picture of the cross-hair in the session; None if lengths were typed."""
+    cross: CrossPicture | None = None
+    """The picture from which further readings are made; None if there is none."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,14 @@ from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.surface.surface import Surface
 from labapp.export.folder import ExportChoice, export
 from labapp.export.frame_result import FrameResult
-from labapp.session.record import BenchEntries, LaserEntries, MirrorEntry, PlanePicture, Record
+from labapp.session.record import (
+    BenchEntries,
+    CrossPicture,
+    LaserEntries,
+    MirrorEntry,
+    PlanePicture,
+    Record,
+)
 from labapp.session.results.measured import Basis
 from labapp.session.session import Session
 from tests.media.cine_writer import write_cine
@@ -154,7 +161,8 @@ def _session(folder: Path, *, embed: bool) -> Path:
             "plane", {("plane-calibration", -1): PlanePicture(6.35, plane, sha256)}
         )
         readings = (("13,7", "", "x"), ("", "18.5", ""))
-        session.set_entries("laser", LaserEntries(readings, 10.0, 0.1, 0.02, sha256))
+        cross = CrossPicture(sha256, tuple((20.0 * k, 9.5) for k in range(6)), 25.0)
+        session.set_entries("laser", LaserEntries(readings, 10.0, 0.1, 0.02, sha256, cross))
         moved = replace(plane, origin_px=(45.0, 590.0))
         session.set_entries("plane", PlanePicture(6.35, moved, sha256, (sha256,)))
         mirror = MirrorEntry("cap.png", "cap", 0.91, 9.75, 0.01, None, sha256)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from labapp.session.record import CrossPicture, LaserEntries
 from labapp.session.session import Session
 
 PICTURE = Path(__file__).parents[2] / "sample_sessions" / "gtaw" / "calibration.png"
@@ -52,9 +53,13 @@ def test_laser_calibration_stores_its_picture(session: Session):
 def test_deleted_pictures_are_reported(session: Session):
     session.calibrate_plane(PICTURE, 6.35)
     session.calibrate_laser([13.676], [18.561], [7.874], picture=np.zeros((10, 15), np.uint8))
+    sha256 = session.keep_picture("cross", np.ones((10, 15), np.uint8))
+    cross = CrossPicture(sha256, ((1.0, 2.0),) * 6, 10.0)
+    session.set_entries("laser", LaserEntries((), 10.0, 0.1, 0.01, cross=cross))
     assert session.problems() == []
     with session._database.transaction() as connection:
         connection.execute("DELETE FROM picture")
     reported = " ".join(session.problems())
     assert "laser-calibration is missing" in reported
     assert "plane-calibration is missing" in reported
+    assert "laser-entries is missing" in reported

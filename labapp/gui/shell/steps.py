@@ -174,7 +174,7 @@ def _setup(facts: Facts) -> State:
 
 def _laser(facts: Facts) -> State:
     if facts.session.laser_entries is not None:
-        return State(Mark.READY, "The entered readings wait to be applied")
+        return State(Mark.READY, "What was entered waits to be applied")
     used, _ = calibrations_in_use(facts.session)
     return _calibrated(facts, facts.session.laser_calibration, used, facts.lacks("laser"))
 

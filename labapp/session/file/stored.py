@@ -44,6 +44,7 @@ from labapp.run.limits import Limits
 from labapp.session.record import (
     BenchCheckRecord,
     BenchEntries,
+    CrossPicture,
     LaserEntries,
     LaserReadings,
     MirrorEntry,
@@ -180,6 +181,7 @@ STORED = {
     "ImageCalibration": Stored(ImageCalibration, shapes={"matrix": "3 3"}),
     "Lens": Stored(Lens),
     "RadialDistortion": Stored(RadialDistortion, shapes={"matrix": "3 3", "half_mm": "2"}),
+    "CrossPicture": Stored(CrossPicture, fits=lambda value: len(value.places_px) == 6),
     "LaserEntries": Stored(LaserEntries),
     "LaserReadings": Stored(LaserReadings),
     "LaserCalibration": Stored(LaserCalibration),

@@ -368,6 +368,45 @@ def test_picture_gives_a_reading_and_is_stored(
         assert again.session.laser_entries is not None  # no longer from the picture
 
 
+def test_picture_and_its_points_are_stored_with_the_session(
+    qtbot: QtBot, page: LaserPage, tmp_path: Path
+) -> None:
+    image = np.arange(480_000, dtype=np.uint32).reshape(600, 800).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "cross.png"), image)
+    page.load_picture(tmp_path / "cross.png")
+    qtbot.waitUntil(lambda: page.picture_view.picture is not None)
+    steps, places = done_steps(page.session), cross_places(12.0)
+    for point in page.picture_view.points:
+        point.nudge(*np.subtract(places[point.name], point.place))
+        point.release()
+    page.scale.set_value(25.0)
+    page.scale.edited.emit(25.0)
+    assert done_steps(page.session) == steps + 7
+    path = page.session.path
+    page.workspace.close()
+    (tmp_path / "cross.png").unlink()
+    with page_of(path) as again:
+        assert states(again.session)["laser"].mark is Mark.READY
+        qtbot.waitUntil(lambda: again.picture_view.picture is not None)
+        assert again.picture_view.isVisibleTo(again)
+        np.testing.assert_array_equal(again.picture_view.picture, image)
+        for name, place in places.items():
+            assert again.places()[name] == pytest.approx(place)
+        assert again.scale.value() == 25.0
+        assert again.add_button.isEnabled()
+        again.workspace.undo()
+        again.workspace.undo()
+        assert again.scale.value() == 10.0
+        assert not again.add_button.isEnabled()
+        again.workspace.redo()
+        assert again.add_button.isEnabled()
+        again.add_button.click()
+        assert again.session.problems() == []
+        again.use_button.click()
+        assert again.session.laser_entries is None
+        assert again.picture_view.picture is None
+
+
 def test_picture_of_another_session_is_removed(
     qtbot: QtBot, page: LaserPage, tmp_path: Path
 ) -> None:

@@ -25,7 +25,7 @@ from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import RIGHT
 from labapp.gui.workspace import Workspace
-from labapp.session.record import LaserEntries
+from labapp.session.record import CrossPicture, LaserEntries
 
 WAYS = (("callipers", "by callipers"), ("picture", "from a picture"))
 
@@ -59,6 +59,7 @@ class LaserPage(Page):
         self.canvas_layout.addWidget(self.canvas)
         self._points: dict[str, DragPoint] = {}
         self._picture: KeptPicture | None = None
+        self._awaited: CrossPicture | None = None
         self._from_sha256: str | None = None
         self._stored: tuple[Path, LaserEntries] | None = None
         self._make_panel()
@@ -78,6 +79,7 @@ class LaserPage(Page):
     def _take_session(self) -> None:
         """Also remove the picture of the previous session."""
         super()._take_session()
+        self._awaited = None
         self._show_picture(None)
 
     def readings(self) -> Readings:
@@ -98,18 +100,25 @@ class LaserPage(Page):
             cells.pop()
         fan_angle_deg = self.fan.value() or presenter.FAN_ANGLE_DEG
         known = self.fan_sigma.value() or 0.0, self.resolution.value() or 0.0
-        return LaserEntries(tuple(cells), fan_angle_deg, *known, self._from_sha256)
+        return LaserEntries(tuple(cells), fan_angle_deg, *known, self._from_sha256, self._cross())
 
     def load_picture(self, path: Path) -> None:
         """Show a picture of the cross with points to drag."""
         session = self.session
+
+        def loaded(picture: KeptPicture) -> None:
+            self._awaited = None
+            self._show_picture(picture)
+            if not self.locked:
+                self._store()
+
         self.start_latest(
-            "Loading the picture", path, lambda _: load_picture(session, path), self._show_picture
+            "Loading the picture", path, lambda _: load_picture(session, path), loaded
         )
 
     def add_reading(self) -> None:
         """Add the lengths from the picture to the table as another reading."""
-        lengths = self._cross()
+        lengths = self._cross_lengths()
         if lengths is None or self._picture is None:
             return
         rows = range(self.table.rowCount())
@@ -189,7 +198,7 @@ class LaserPage(Page):
             tooltip="Distance between the two points marked on the scale",
         )
         self.scale.set_value(10.0)
-        self.scale.edited.connect(lambda _: self._dragged())
+        self.scale.edited.connect(lambda _: self._placed())
         self.lengths = Message(2)
         tip = "Add these lengths to the table as a further reading"
         self.add_button = button("Add as a reading", tip, self.add_reading)
@@ -216,6 +225,7 @@ class LaserPage(Page):
         self.fan.set_value(entries.fan_angle_deg)
         self.fan_sigma.set_value(entries.fan_angle_sigma_deg)
         self.resolution.set_value(entries.resolution_mm)
+        self._take_cross(entries.cross)
 
     def _store(self) -> None:
         """Show the result of changed entries, and store them until they are applied."""
@@ -301,6 +311,7 @@ class LaserPage(Page):
                 color = "#ffb000" if name in ENDS else "#40c4ff"
                 point = DragPoint(name, *places[name], color)
                 point.moved.connect(lambda *_: self._dragged())
+                point.placed.connect(self._placed)
                 self._points[name] = point
                 self.picture_view.add_point(point)
         elif former is None or former.shape != image.shape:
@@ -308,11 +319,54 @@ class LaserPage(Page):
                 point.set_place(*places[name])
         self._dragged()
 
+    def _take_cross(self, cross: CrossPicture | None) -> None:
+        """Show a stored picture with its points; None removes the picture."""
+        self._awaited, shown = cross, self._picture
+        if cross is None:
+            self._show_picture(None)
+        elif shown is not None and shown.sha256 == cross.picture_sha256:
+            self._place(shown)
+        else:
+            session, key = self.session, cross.picture_sha256
+            self.workspace.tasks.start(
+                "Showing the picture of the cross",
+                lambda _: KeptPicture("picture", session.picture(key), key),
+                self._place,
+            )
+
+    def _place(self, picture: KeptPicture) -> None:
+        """Show a stored picture that is still awaited, with its points in their places."""
+        cross = self._awaited
+        if cross is None or cross.picture_sha256 != picture.sha256:
+            return
+        self._awaited = None
+        if self._picture is None:
+            self.way.set_value("picture")
+            self._show_way("picture")
+        self.scale.set_value(cross.scale_mm)
+        self._show_picture(picture)
+        for name, place in zip((*ENDS, *SCALE), cross.places_px, strict=True):
+            self._points[name].set_place(*place)
+        self._dragged()
+
+    def _cross(self) -> CrossPicture | None:
+        """Picture and points as a session stores them; None without any."""
+        if self._picture is None or not self._picture.sha256:
+            return self._awaited
+        places = tuple(self._points[name].place for name in (*ENDS, *SCALE))
+        return CrossPicture(self._picture.sha256, places, self.scale.value() or 0.0)
+
+    def _placed(self) -> None:
+        """Store the points and the length of the scale."""
+        self._dragged()
+        if self._picture is not None and not self.locked:
+            self._store()
+
     def places(self) -> dict[str, Place]:
         """(u, v) of the points by name, px."""
         return {name: point.place for name, point in self._points.items()}
 
-    def _cross(self) -> tuple[float, float, float] | None:
+    def _cross_lengths(self) -> tuple[float, float, float] | None:
         picture = self.picture_view.picture
         if not self._points or picture is None:
             self.lengths.setText("")
@@ -332,7 +386,8 @@ class LaserPage(Page):
         return lengths
 
     def _dragged(self) -> None:
-        unmarked = "" if self._cross() is not None else "Place the points on the cross first"
+        is_marked = self._cross_lengths() is not None
+        unmarked = "" if is_marked else "Place the points on the cross first"
         offer(self.add_button, self.locked or unmarked)
 
 
