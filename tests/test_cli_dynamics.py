@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 import labapp as package
-from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import SHAPES, SIZES
 from labapp.errors import InputError
 from labapp.export.folder import ExportChoice
 from labapp.export.result_folder import measured_in
-from labapp.session.results.measured import Basis
 from labapp.session.session import Session
 from tests.conftest import Run
 
@@ -63,21 +61,6 @@ def test_tables_and_pictures_of_a_session(labapp: Run, gtaw: Path, tmp_path: Pat
     assert all(float(r["low_95_per_hz"]) < float(r["density_per_hz"]) for r in spectrum)
     for name in ("dynamics.png", "modes.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.slow
-def test_frames_that_repeat_the_one_before_are_left_out_with_a_warning(
-    labapp: Run, gtaw: Path, tmp_path: Path
-) -> None:
-    with Session.open(gtaw) as session:
-        basis = Basis(session.setup, session.settings)
-        session._results.put(12, Measurement("repeated", "", "fit"), basis, None)
-        session.export(tmp_path / "results", ExportChoice(surfaces=frozenset({"csv"})))
-    for source in gtaw, tmp_path / "results":
-        code, _, stderr = labapp("dynamics", source, "--out", tmp_path / "out")
-        assert code == 0
-        assert re.findall(r"before: ([\d, ]+);", stderr) == ["12"]
-        assert len(rows(tmp_path / "out" / "series.csv")) == 29
 
 
 @pytest.mark.slow

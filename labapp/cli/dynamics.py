@@ -110,22 +110,16 @@ def _analysed(
 ) -> Dynamics:
     """Analyse a session or a results folder, with the given signals or the session's."""
     from labapp.export.dynamics import dynamics_of, measured_of
-    from labapp.export.frame_result import REPEATED
-    from labapp.export.result_folder import measured_in, repeated_in
-    from labapp.media.survey import repeated_words
+    from labapp.export.result_folder import measured_in
     from labapp.session.session import Session
 
     with ExitStack() as at_end:
         if source.is_dir():
             signals, measured = given, measured_in(source)
-            repeated = repeated_in(source)
         else:
             session = at_end.enter_context(Session.open(source, read_only=True))
             signals = given or session.signals
             measured = measured_of(session.frame_results(stale=False))
-            repeated = session.overview().frames_with(REPEATED)
-        if repeated:
-            typer.echo(f"warning: {repeated_words(repeated)}", err=True)
         if start is not None or align is not None:
             signals = _aligned(signals, start, align)
         return dynamics_of(measured, signals.timed() if signals else {}, settings)

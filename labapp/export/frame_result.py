@@ -8,9 +8,6 @@ from dataclasses import dataclass, replace
 from labapp.core.pipeline import Measurement
 from labapp.core.recording.residual_check import Residuals
 
-REPEATED = "repeated"
-"""Status of a frame with the pixels of the one before (`media.Frame.repeats`)."""
-
 
 @dataclass(frozen=True, repr=False)
 class FrameResult:

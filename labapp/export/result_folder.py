@@ -16,7 +16,6 @@ from labapp.core.surface.measures import SHAPES, SIZES
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
 from labapp.export.dynamics import MeasuredSurface, no_time_base
-from labapp.export.frame_result import REPEATED
 
 LARGEST = 1 << 31
 """Largest table, bytes; boundary.csv of 100,000 frames has 1.5 GB, and is read row by row."""
@@ -72,14 +71,6 @@ def measured_in(folder: Path) -> Iterator[MeasuredSurface]:
         boundary = _boundary(folder / "boundary.csv", list(outline[1]))
         surface = _surface(folder / f"surface_{int(frame):06d}.csv", boundary)
         yield int(frame), time_s, surface, boundary, sizes
-
-
-def repeated_in(folder: Path) -> list[int]:
-    """Numbers of the frames that repeat the one before; raises as `measured_in`."""
-    path = folder / "measures.csv"
-    return [
-        int(_number(path, row, "frame")) for row in _rows(path) if row.get("status") == REPEATED
-    ]
 
 
 def _rows(path: Path) -> Iterator[dict[str, str]]:

@@ -15,7 +15,7 @@ from labapp.core.pipeline import Measurement, Settings, setup_status
 from labapp.core.values import FloatArray
 from labapp.export.frame_result import FrameResult
 from labapp.media import Frame
-from labapp.run.measurers import FrameReader, Read
+from labapp.run.measurers import Read, read_frame
 
 CLASSIFIED_AT_ONCE = 400
 """The most frames whose pulses are classified together: some tens of periods."""
@@ -34,9 +34,12 @@ class LineMeasurer:
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`. Results come many at a time."""
-        tracker, reader = LineTracker(), FrameReader(self.read, self.setup, self.settings)
+        tracker = LineTracker()
         for chosen in _classified_together(frames):
-            begun = [(number, reader(number)) for number in chosen]
+            begun = [
+                (number, read_frame(self.read, number, self.setup, self.settings))
+                for number in chosen
+            ]
             seen = [frame for _, frame in begun if isinstance(frame, Frame)]
             time_s = np.array([np.nan if one.time_s is None else one.time_s for one in seen])
             step = float(np.median(np.diff(time_s))) if len(seen) > 1 else 0.0

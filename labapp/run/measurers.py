@@ -14,7 +14,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -26,7 +26,7 @@ from labapp.config.setup import Setup
 from labapp.core.pipeline import FrameCorrection, Measurement, Settings, measure
 from labapp.core.recording.residual_check import Residuals
 from labapp.errors import InputError
-from labapp.export.frame_result import REPEATED, FrameResult, without_surface
+from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.tables import table_rows
 from labapp.media import Frame, GreyImage, open_source
 from labapp.simulation.parallel import (
@@ -81,7 +81,7 @@ class ColdMeasurer:
     """Measures each frame without a prior; its neighbours vote on its rows (`_with_rows_voted`)."""
 
     read: Read
-    """Reads frames; see `FrameReader`."""
+    """Reads frames; one that cannot be read gets the status ``unreadable``."""
     setup: Setup
     settings: Settings
     corrected: Corrected = lambda _: None
@@ -91,12 +91,12 @@ class ColdMeasurer:
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
-        reader = FrameReader(self.read, self.setup, self.settings, self.corrected)
-        measured = in_order((self._submit(number, reader(number)) for number in frames), AHEAD)
+        measured = in_order(map(self._submit, frames), AHEAD)
         return _with_rows_voted(measured, _new_vote(self.setup, self.settings))
 
-    def _submit(self, number: int, frame: Frame | FrameResult) -> Future[FrameResult]:
-        """Measure a frame in the pool, or at once if there is none."""
+    def _submit(self, number: int) -> Future[FrameResult]:
+        """Read a frame in this process, and measure it in the pool, or at once if there is none."""
+        frame = read_frame(self.read, number, self.setup, self.settings)
         if isinstance(frame, FrameResult):
             return InlineExecutor().submit(lambda: frame)
         pool = self.pool or InlineExecutor()
@@ -146,43 +146,20 @@ def _with_rows_voted(
             yield judged()
 
 
-@dataclass
-class FrameReader:
-    """Reads frames to be measured; parameters as of `ColdMeasurer`."""
+def read_frame(read: Read, number: int, setup: Setup, settings: Settings) -> Frame | FrameResult:
+    """Return the frame, or its result if it cannot be read.
 
-    read: Read
-    setup: Setup
-    settings: Settings
-    corrected: Corrected = lambda _: None
-    _last: Frame | None = None
-
-    def __call__(self, number: int) -> Frame | FrameResult:
-        """Return the frame, or its result if it cannot be read or repeats the one before.
-
-        Raises
-        ------
-        InputError
-            If its size is not that of the picture with which the set-up was calibrated.
-        """
-        before, scheme = self._before(number), self.settings.scheme
-        try:
-            self._last = frame = self.read(number)
-        except InputError as error:
-            return FrameResult(number, None, Measurement("unreadable", str(error), scheme))
-        self.setup.require_size(frame.image.shape, f"frame {number}")
-        is_repeated = before is not None and frame.repeats(before)
-        if is_repeated and self.corrected(number) is None:
-            reason = f"all its pixels are those of frame {number - 1}"
-            return FrameResult(number, frame.time_s, Measurement(REPEATED, reason, scheme))
-        return frame
-
-    def _before(self, number: int) -> Frame | None:
-        """Return the frame before; None if there is none, or if it cannot be read."""
-        if self._last is not None and self._last.index == number - 1:
-            return self._last
-        with suppress(InputError):
-            return self.read(number - 1) if number else None
-        return None
+    Raises
+    ------
+    InputError
+        If its size is not that of the picture with which the set-up was calibrated.
+    """
+    try:
+        frame = read(number)
+    except InputError as error:
+        return FrameResult(number, None, Measurement("unreadable", str(error), settings.scheme))
+    setup.require_size(frame.image.shape, f"frame {number}")
+    return frame
 
 
 def _cold(
@@ -208,8 +185,8 @@ class WarmMeasurer:
 
     After a frame whose rows are outvoted the next is measured without tracking, and votes: if the
     pool has moved by the spacing of the rays, the vote turns. A manually corrected frame is
-    measured independently. Corrected, unreadable and repeated frames and changes of the step
-    between frames are gaps for the track (`WarmChain.skip`).
+    measured independently. Corrected frames, unreadable frames and changes of the step between
+    frames are gaps for the track (`WarmChain.skip`).
     """
 
     read: Read
@@ -253,14 +230,13 @@ class WarmMeasurer:
                     yield FrameResult(number, frame.time_s, found, warm.track_lost)
 
     def _read_ahead(self, frames: Iterable[int]) -> Iterator[list[tuple[int, Frame | FrameResult]]]:
-        """Yield numbers and frames (`FrameReader`), some at once, see `_next_batch`."""
+        """Yield numbers and frames (`read_frame`), some at once, see `_next_batch`."""
         numbers = iter(frames)
-        reader = FrameReader(self.read, self.setup, self.settings, self.corrected)
         while chosen := list(islice(numbers, READ_AT_ONCE)):
             read: list[tuple[int, Frame | FrameResult]] = []
             try:
                 for number in chosen:
-                    read.append((number, reader(number)))
+                    read.append((number, read_frame(self.read, number, self.setup, self.settings)))
             except InputError:  # after the frames before it
                 yield read
                 raise

@@ -467,44 +467,6 @@ def test_two_frames_whose_rows_differ_are_both_refused(
     assert [result.measurement.status for result in results] == ["ambiguous-rows"] * 2
 
 
-REPEATING = (0, 1, 2, 2, 3, 3, 3, 4)
-"""Which frame of the recording each frame shows."""
-
-
-def statuses_of_repeating(
-    measurer: Any, recording: RecordingMeasurer, frames: Sequence[int], *, timed: bool = True
-) -> list[str]:
-    with open_source(recording.path) as source:
-
-        def read(number: int) -> Frame:
-            time_s = number / 10 if timed else None
-            return Frame(number, time_s, source.frame(REPEATING[number]).image)
-
-        def corrected(number: int) -> Correction | None:
-            return start_correction(measure(read(5).image, *given)[0]) if number == 5 else None
-
-        given = recording.setup.bench, Settings()
-        results = list(measurer(read, recording.setup, Settings(), corrected)(frames))
-    assert [result.time_s for result in results] == [k / 10 if timed else None for k in frames]
-    return [result.measurement.status for result in results]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("measurer", [ColdMeasurer, WarmMeasurer])
-def test_frame_with_the_pixels_of_the_one_before_is_not_measured(
-    measurer: Any, recording: RecordingMeasurer
-) -> None:
-    statuses = statuses_of_repeating(measurer, recording, range(len(REPEATING)))
-    # Frame 5 is corrected by hand.
-    assert statuses == ["ok", "ok", "ok", "repeated", "ok", "ok", "repeated", "ok"]
-
-
-def test_repeated_frame_is_found_by_itself(recording: RecordingMeasurer) -> None:
-    assert statuses_of_repeating(ColdMeasurer, recording, [3]) == ["repeated"]
-    assert statuses_of_repeating(ColdMeasurer, recording, [3], timed=False) == ["ok"]
-    assert statuses_of_repeating(ColdMeasurer, recording, [1, 3]) == ["ok", "repeated"]
-
-
 @pytest.mark.slow
 def test_frames_are_measured_again_after_the_pool_has_moved_by_a_row(
     recording: RecordingMeasurer,

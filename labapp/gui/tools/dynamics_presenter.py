@@ -10,13 +10,11 @@ import numpy as np
 
 from labapp.core.dynamics.oscillation import FEWEST
 from labapp.core.surface.measures import WITH_SIGMA
-from labapp.export.frame_result import REPEATED
 from labapp.gui.curves import titled
 from labapp.gui.pages.trends.presenter import SIGNALS
-from labapp.media.survey import repeated_words
 from labapp.session.results.trends import BY_KEY
 from labapp.studies.tables import Table
-from labapp.text import capitalized, pluralize, with_sigma
+from labapp.text import pluralize, with_sigma
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics
@@ -119,11 +117,10 @@ def range_text(seen: Overview) -> str:
     span = float(time_s[-1] - time_s[0]) + step
     missing = round(span / step) - len(time_s)
     gaps = f" {pluralize(missing, 'frame')} between them without one." * (missing > 0)
-    repeated = capitalized(repeated_words(seen.frames_with(REPEATED)))
     return (
         f"{len(time_s)} frames with a surface in {span:.4g} s, {1 / step:.4g} frames/s: "
         f"oscillations from {2 / span:.2g} to {0.5 / step:.4g} Hz. Faster ones show as slower "
-        f"ones.{gaps}" + f" {repeated}." * bool(repeated)
+        f"ones.{gaps}"
     )
 
 

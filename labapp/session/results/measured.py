@@ -101,11 +101,6 @@ class Overview(ReadOnlyArrays):
     measures: dict[str, FloatArray]
     """Name in `Measures` → values, shape (n,); NaN if unknown."""
 
-    def frames_with(self, status: str) -> list[int]:
-        """Numbers of the frames with a status."""
-        pairs = zip(self.frame.tolist(), self.status, strict=True)
-        return [frame for frame, found in pairs if found == status]
-
 
 class _Row(NamedTuple):
     """A stored result: inputs, time, and the packed measurement."""

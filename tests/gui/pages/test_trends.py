@@ -11,12 +11,9 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
-from labapp.core.pipeline import Measurement
 from labapp.gui.pages.trends.page import TrendsPage
 from labapp.gui.pages.trends.presenter import CORRECTED, SIGNALS, STALE, TrendOptions, show
-from labapp.gui.tools.dynamics_presenter import range_text
 from labapp.gui.workspace import Workspace
-from labapp.session.results.measured import Basis
 from labapp.session.session import Session
 from labapp.session.signals import Signals
 from labapp.text import with_sigma
@@ -48,17 +45,6 @@ def test_trends_of_the_sample(gtaw: Path) -> None:
     assert shown.words == "30 of 30 frames count"
     assert shown.spectrum == ()
     assert shown.signals_words.startswith("None.")
-
-
-def test_frames_that_repeat_the_one_before_are_counted_apart(gtaw: Path) -> None:
-    with Session.open(gtaw) as session:
-        basis = Basis(session.setup, session.settings)
-        for frame, status in (3, "repeated"), (4, "no-dots"):
-            session._results.put(frame, Measurement(status, "", "fit"), basis, None)
-        shown, seen = show(session, TrendOptions()), session.overview()
-    assert shown.words.startswith("28 of 30 frames count, 1 with the pixels of the one before")
-    assert "1 without a surface" in shown.words
-    assert "the one before: 3;" in range_text(seen)
 
 
 def test_trends_of_a_concave_pool_show_its_depth(copy_sample) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 
 from labapp.core.lines.track import oscillation_frequency
 from labapp.core.values import FloatArray, IntArray
-from labapp.export.frame_result import REPEATED
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow
 from labapp.session.results.line_trends import (
@@ -264,11 +263,10 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
 def _counted(seen: Overview, course: Trend) -> str:
     total, has = len(seen.frame), len(course.frame)
     parts = [f"{int(course.counts.sum())} of {total} frames count"]
-    unmeasured, repeated = seen.status.count(""), seen.status.count(REPEATED)
+    unmeasured = seen.status.count("")
     reasons = (
         (unmeasured, "not measured yet"),
-        (repeated, "with the pixels of the one before"),
-        (total - has - unmeasured - repeated, "without a surface"),
+        (total - has - unmeasured, "without a surface"),
         (int(course.stale.sum()), "out of date"),
         (int(course.outlying.sum()), "stand out"),
     )
