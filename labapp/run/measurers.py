@@ -404,6 +404,7 @@ def load_all() -> None:
     import scipy.spatial  # noqa: F401 - otherwise loaded when it is first used
 
     import labapp.core.images.centroid_kernels
+    import labapp.core.images.prominence_kernels
     import labapp.core.images.size_kernels
     import labapp.core.matching.initial.quadric_kernels
     import labapp.core.matching.label_growth_kernels
