@@ -56,6 +56,11 @@ PROMINENT, PROMINENT_SHARE = 0.5, 0.2
 """A peak stands out from a ridge, such as the edge of a saturated spot, if its prominence exceeds
 these shares of the threshold or of its response: that of noise on the ridge is less than both."""
 
+SATURATED, SATURATED_SIZES, FEW_SATURATED = 0.4, 3.0, 50
+"""A peak is in saturated light if more than the first share of the pixels within the second, in
+dot sizes along either axis, are; frames with fewer saturated pixels than the last have no such
+light. Of dots that are saturated themselves, one in three of these pixels is."""
+
 PEAK_GAIN = 1 / (1 + NARROW**2) - 1 / (1 + WIDE**2)
 """Peak height of a Gaussian dot of the band's size after the band-pass, over its height before."""
 
@@ -165,7 +170,7 @@ class BandPassed:
     def _over(self, tuning: DetectorTuning, are_crowded: bool) -> Peaks:
         """Return the peaks above the threshold, but for those of a broad spot or of a ridge.
 
-        Noise makes peaks on these.
+        Noise makes peaks on these. Nor are peaks in saturated light returned.
         """
         from labapp.core.images import band_pass_kernels, prominence_kernels
 
@@ -181,7 +186,17 @@ class BandPassed:
         if not are_crowded:
             prominence = prominence_kernels.prominences(band, low, u // step, v // step)
             over &= prominence > np.minimum(PROMINENT * floor, PROMINENT_SHARE * bright)
+        over &= ~self._is_saturated(u, v)
         return u[over], v[over], bright[over]
+
+    def _is_saturated(self, u: IntArray, v: IntArray) -> BoolArray:
+        """Whether peaks are in saturated light, where dots are not seen."""
+        at_most = self.picture == self.picture.max()
+        if np.count_nonzero(at_most) < FEW_SATURATED:
+            return np.zeros(len(u), bool)
+        side = 2 * round(SATURATED_SIZES * self.size) + 1
+        share = cv2.blur(at_most.astype(np.float32), (side, side), borderType=cv2.BORDER_REFLECT)
+        return np.asarray(share[v, u] > SATURATED)
 
     def _without_broad(self, u: IntArray, v: IntArray, bright: FloatArray) -> FloatArray:
         """Responses of peaks without that of a broader spot that they are on, such as the arc's.
