@@ -85,6 +85,13 @@ def test_frames_are_measured_into_tables(labapp: Run, setup: Path, tmp_path: Pat
     assert [row["status"] for row in features] == ["ok", "no-lines"]
     assert float(features[0]["pool_height_mm"]) == pytest.approx(0.25, rel=0.1)
     assert features[1]["pool_height_mm"] == ""
+    for value, sigma, true in (
+        ("pool_width_mm", "pool_width_sigma_mm", 6.0),
+        ("pool_curvature_per_mm", "pool_curvature_sigma_per_mm", 0.25 * 2 / 3.0**2),
+    ):
+        off = float(features[0][value]) - true
+        assert abs(off) < 3 * float(features[0][sigma]) < true
+        assert features[1][sigma] == ""
     assert "width_mm" not in features[0]  # of the pool, in other tables
     assert float(features[0]["plane_width_mm"]) > 10.0
     assert [row["setup_status"] for row in features] == ["entered", "entered"]

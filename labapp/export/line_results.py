@@ -26,10 +26,10 @@ FEATURE_COLUMNS = (
     "plane_width_mm", "plane_height_mm", "plane_area_mm2", "plane_spacing_mm",
     "plane_curvature_per_mm", "plane_asymmetry", "pool_height_mm",
     "pool_height_sigma_mm", "pool_width_mm", "pool_curvature_per_mm", "misfit", "margin",
-    "setup_status",
+    "setup_status", "pool_width_sigma_mm", "pool_curvature_sigma_per_mm",
 )  # fmt: skip
-"""``plane_…`` are quantities of the lines on the imaging plane. ``pool_height_sigma_mm`` does not
-include the set-up, unlike ``height_sigma_mm`` of dots; ``setup_status`` is its reliability."""
+"""``plane_…`` are quantities of the lines on the imaging plane. ``pool_…_sigma_…`` do not include
+the set-up, unlike ``…_sigma_mm`` of dots; ``setup_status`` is its reliability."""
 TRACK_COLUMNS = (
     "frame", "time_s", "pulse", "pulse_probability", "followed", "shift_px", "tilt_px", "bend_px",
     "agreeing_share",
@@ -104,7 +104,9 @@ def feature_rows(
         seen = one.features
         surface = one.surface if one.status == "ok" else None
         measured: tuple[float, ...] = (np.nan,) * 6
+        sigma: tuple[float, ...] = (np.nan,) * 2
         if surface is not None:
+            sigma = surface.width_sigma_mm, surface.curvature_sigma_per_mm
             measured = (
                 *(surface.height_mm, surface.height_sigma_mm, surface.width_mm),
                 *(surface.curvature_per_mm, surface.misfit, surface.margin),
@@ -117,6 +119,7 @@ def feature_rows(
                 *map(_cell, (seen.spacing_mm, seen.curvature_per_mm, seen.asymmetry)),
                 *map(_cell, measured),
                 setup_status,
+                *map(_cell, sigma),
             ]
         )
     return rows

@@ -16,7 +16,7 @@ from labapp.core.lines.model import LineData, LineModel
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import CannotMeasure
 from labapp.simulation.camera import CameraView
-from labapp.simulation.pools import Pool, spherical_cap
+from labapp.simulation.pools import Pool, egg, spherical_cap
 from tests.line_truth.frames import LineFrame, LineLook, render_lines
 
 RIG = LineRig(
@@ -103,21 +103,61 @@ def test_exact_lines_give_the_surface_and_its_uncertainty(peak_mm: float):
     assert fitted.margin > 50
 
 
-def test_single_line_raises_too_few_lines():
-    data, numbers = exact_data(rendered(spherical_cap(6.0, 0.25)))
-    on, ends = data.line == 2, data.end_line == 2
-    alone = replace(
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("pool", "status"),
+    [
+        pytest.param(egg(6.51, 3.02, 4.41, -0.25, (-0.27, -0.09)), "ok", id="hollow"),
+        pytest.param(egg(6.2, 2.9, 4.71, 0.36, (0.22, -0.39)), "ok", id="long"),
+        pytest.param(egg(6.52, 2.32, 3.14, 0.35, (-0.06, 0.04)), None, id="short"),
+    ],
+)
+def test_uncertainties_include_pools_of_other_widths(pool: Pool, status: str | None):
+    """The position along the fan is unknown: nearly the same lines come from other widths."""
+    frame = rendered(pool)
+    data, numbers = exact_data(frame, sigma_mm=0.02)
+    fitted = fit_lines(data, [numbers, numbers[::-1]], RIG)
+    assert fitted.status == (status or fitted.status)
+    points = np.concatenate([one.point_mm for one in frame.lines])
+    height = points[np.argmax(np.abs(points[:, 2])), 2]
+    assert abs(fitted.height_mm - height) < 2.5 * fitted.height_sigma_mm
+    assert abs(fitted.width_mm - np.ptp(points[:, 0])) < 2.5 * fitted.width_sigma_mm
+
+
+def first_lines(data: LineData, count: int) -> LineData:
+    """Return the data of the lowest lines."""
+    on, ends = data.line < count, data.end_line < count
+    return replace(
         data,
-        line=np.zeros(on.sum(), int),
+        line=data.line[on],
         plane_mm=data.plane_mm[on],
         normal=data.normal[on],
         sigma_mm=data.sigma_mm[on],
-        end_line=np.zeros(ends.sum(), int),
+        end_line=data.end_line[ends],
         end_mm=data.end_mm[ends],
         end_sigma_mm=data.end_sigma_mm[ends],
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("numberings", "status"),
+    [
+        pytest.param([[1, 2, 3, 4]], "ok", id="known"),
+        pytest.param([[1, 2, 3, 4], [2, 3, 4, 5]], "profile", id="or-their-neighbours"),
+        pytest.param([[5, 4, 3, 2]], "profile", id="wrong-order"),
+    ],
+)
+def test_four_of_five_lines_need_their_numbers(numberings: list[list[int]], status: str):
+    data, _ = exact_data(rendered(egg(6.0, 2.8, 3.2, 0.3)), sigma_mm=0.02)
+    four = [np.array(numbers, float) for numbers in numberings]
+    assert fit_lines(first_lines(data, 4), four, RIG).status == status
+
+
+def test_single_line_raises_too_few_lines():
+    data, numbers = exact_data(rendered(spherical_cap(6.0, 0.25)))
     with pytest.raises(CannotMeasure) as error:
-        fit_lines(alone, [numbers[2:3]], RIG)
+        fit_lines(first_lines(data, 1), [numbers[:1]], RIG)
     assert error.value.status == "too-few-lines"
 
 

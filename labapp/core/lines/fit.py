@@ -33,11 +33,17 @@ HALF_WIDTH_MM = 2.8
 POOR_COST = 2.0
 """If the cost per point is larger, the quadric is also fitted from a second initial radius."""
 
-NEAR_COST, NEAR_COST_MORE = 4.0, 60.0
-"""Quadrics that cost less than this multiple of the best one, plus this, are refined."""
+NEAR_COST, NEAR_COST_MORE, MOST_REFINED = 4.0, 60.0, 3
+"""Quadrics that cost less than this multiple of the best one, plus this, are refined, at most this
+many of each order of the lines."""
 
 QUADRIC_ROUNDS, SPLINE_ROUNDS = 20, 20
 MARGIN_MM = 0.8
+
+STRETCHES, ALIKE_COST = (0.7, 1.25), 12.0
+"""Factors by which the quadric is made narrower and wider for two more fits, and largest additional
+cost of a surface that counts. Pools of different widths reflect nearly the same lines, as the
+position along the fan is unknown: the iterations end near where they begin."""
 
 AGREES = 3.0
 """Largest standardised residual of a point or an end that agrees with the surface."""
@@ -56,10 +62,11 @@ height of hollow pools is 3 % too large, more than its ±."""
 SETTLED = 0.05
 """The iteration stops if a step reduces the cost by less."""
 
-LEAST_MARGIN = 6.0
-"""Least difference of the cost of another sign or numbering from the best."""
+LEAST_MARGIN, NUMBERS_MARGIN = 6.0, 0.5
+"""Least difference of the cost of another sign, height or numbering from the best; for another
+numbering, plus this share of the best: it may fit worse only as a line is found worse."""
 
-MOST_RELATIVE_SIGMA, MOST_MISFIT = 0.1, 0.85
+MOST_RELATIVE_SIGMA, MOST_MISFIT = 0.1, 0.35
 """Largest relative standard uncertainty of a height that is determined, and largest χ² over its
 degrees of freedom of a surface that fits."""
 
@@ -73,7 +80,8 @@ class LineSurface(ReadOnlyArrays):
     surface
         The surface, z = 0 at the boundary.
     covariance
-        Covariance of its coefficients, shape (p, p), mm².
+        Covariance of its coefficients, shape (p, p), mm². It includes the differences from the
+        surfaces of other widths that agree as well with the lines.
     numbers
         Number of each line in the pattern, from the lowest in the picture up, shape (k,).
     point_mm
@@ -82,10 +90,12 @@ class LineSurface(ReadOnlyArrays):
     misfit
         χ² of points and ends over its degrees of freedom.
     margin
-        Additional cost of the next best sign or numbering; infinite if there is none.
+        Additional cost of the next best sign or height; infinite if there is none.
     status
         ``ok``, or ``profile`` if the lines do not fully determine the surface: its heights are then
         not a measurement, although slopes along the lines may be.
+    width_sigma_mm
+        Standard uncertainty of `width_mm`, mm.
     """
 
     surface: SplineSurface
@@ -95,6 +105,7 @@ class LineSurface(ReadOnlyArrays):
     misfit: float
     margin: float
     status: str
+    width_sigma_mm: float = float("nan")
 
     @cached_property
     def peak_mm(self) -> FloatArray:
@@ -134,12 +145,21 @@ class LineSurface(ReadOnlyArrays):
     @property
     def curvature_per_mm(self) -> float:
         """Mean curvature of the least-squares quadric of the surface, 1/mm; positive if convex."""
-        x, y = self.point_mm[:, 0], self.point_mm[:, 1]
-        z = self.surface.height(x, y)
-        known = np.isfinite(z)  # a ray may meet the surface outside the splines' domain
-        terms = _monomials(x - x.mean(), y - y.mean())[known]
-        fitted = np.linalg.lstsq(terms, z[known], rcond=None)[0]
-        return float(-fitted[3] - fitted[5])
+        return float(self._curvature @ self.surface.coefficients)
+
+    @property
+    def curvature_sigma_per_mm(self) -> float:
+        """Standard uncertainty of `curvature_per_mm`, 1/mm."""
+        return float(np.sqrt(self._curvature @ self.covariance @ self._curvature))
+
+    @cached_property
+    def _curvature(self) -> FloatArray:
+        """Derivatives of the mean curvature w.r.t. the coefficients, shape (p,), mm⁻²."""
+        x, y = self.point_mm[:, :2].T
+        known = np.isfinite(self.surface.height(x, y))  # a ray may leave the splines' domain
+        x, y = x[known], y[known]
+        quadric = np.linalg.pinv(_monomials(x - x.mean(), y - y.mean()))
+        return np.asarray(-(quadric[3] + quadric[5]) @ self.surface.basis.matrix(x, y))
 
 
 @dataclass(frozen=True)
@@ -150,6 +170,19 @@ class _Hypothesis:
     model: LineModel
     coefficients: FloatArray
     cost: float
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """A spline surface refined from a quadric, and its cost.
+
+    ``smooth``: it bends no more than expected, so that its uncertainties hold.
+    """
+
+    surface: LineSurface
+    cost: float
+    smooth: bool
+    start: _Hypothesis
 
 
 def fit_lines(data: LineData, numberings: list[FloatArray], rig: LineRig) -> LineSurface:
@@ -173,22 +206,58 @@ def fit_lines(data: LineData, numberings: list[FloatArray], rig: LineRig) -> Lin
         (_best_quadric(data, numbers, rig) for numbers in numberings),
         key=lambda one: one.cost,
     )
-    limit = NEAR_COST * tried[0].cost + NEAR_COST_MORE
-    near = [one for one in tried if one.cost < limit][:3]
-    refined = sorted((_refined(one, data) for one in near), key=lambda one: one[1])
-    best, cost = refined[0]
-    others = [other - cost for one, other in refined[1:] if _differ(one, best)]
-    others += [one.cost - tried[0].cost for one in tried[len(near) :]]
+    near, others = _near(tried)
+    refined = sorted((_refined(one, data) for one in near), key=lambda one: one.cost)
+    best = refined[0]
+    others += [one.cost - best.cost for one in refined[1:] if _differ(one.surface, best.surface)]
     margin = min(others, default=np.inf)
-    return replace(best, margin=margin, status=_status(best, margin))
+    least = LEAST_MARGIN + NUMBERS_MARGIN * best.cost
+    numbered = all(one.cost - best.cost >= least for one in refined[1:])
+    if numbered and _is_determined(best, margin):
+        best = _of_widths(best, data)
+    status = "ok" if numbered and _is_determined(best, margin) else "profile"
+    return replace(best.surface, margin=margin, status=status)
 
 
-def _status(one: LineSurface, margin: float) -> str:
-    sure = one.height_sigma_mm <= MOST_RELATIVE_SIGMA * abs(one.height_mm)
-    fits = one.misfit <= MOST_MISFIT
-    enough = len(np.unique(one.numbers)) >= LEAST_LINES
-    determined = enough and sure and fits and one.bulges and margin >= LEAST_MARGIN
-    return "ok" if determined else "profile"
+def _near(tried: list[_Hypothesis]) -> tuple[list[_Hypothesis], list[float]]:
+    """Quadrics to refine, of both orders of the lines, and the additional costs of the others."""
+    limit = NEAR_COST * tried[0].cost + NEAR_COST_MORE
+    near, others = list[_Hypothesis](), list[float]()
+    left = {True: MOST_REFINED, False: MOST_REFINED}
+    for one in tried:
+        upwards = bool(one.numbers[-1] > one.numbers[0])
+        if one.cost < limit and left[upwards]:
+            left[upwards] -= 1
+            near.append(one)
+        else:
+            others.append(one.cost - tried[0].cost)
+    return near, others
+
+
+def _is_determined(one: _Refined, margin: float) -> bool:
+    """Whether the lines determine the surface: see the statuses of `LineSurface`."""
+    surface = one.surface
+    sure = surface.height_sigma_mm <= MOST_RELATIVE_SIGMA * abs(surface.height_mm)
+    fits = surface.misfit <= MOST_MISFIT and one.smooth
+    enough = len(np.unique(surface.numbers)) >= LEAST_LINES
+    return enough and sure and fits and surface.bulges and margin >= LEAST_MARGIN
+
+
+def _of_widths(found: _Refined, data: LineData) -> _Refined:
+    """Fit narrower and wider pools, too: return the best, with the others in its uncertainties."""
+    again = [found, *(_refined(found.start, data, stretch) for stretch in STRETCHES)]
+    best = min(again, key=lambda one: one.cost)
+    surface = best.surface
+    alike = [one.surface for one in again if one.cost - best.cost < ALIKE_COST]
+    away = np.stack([one.surface.coefficients - surface.surface.coefficients for one in alike])
+    wider = np.array([one.width_mm - surface.width_mm for one in alike])
+    share = 1 / len(STRETCHES)
+    surface = replace(
+        surface,
+        covariance=surface.covariance + share * away.T @ away,
+        width_sigma_mm=float(np.sqrt(surface.width_sigma_mm**2 + share * wider @ wider)),
+    )
+    return replace(best, surface=surface)
 
 
 def _differ(one: LineSurface, other: LineSurface) -> bool:
@@ -308,16 +377,18 @@ def _dense(band: FloatArray) -> FloatArray:
     return dense + np.tril(dense, -1).T
 
 
-def _refined(start: _Hypothesis, data: LineData) -> tuple[LineSurface, float]:
-    """Refine a quadric as a smooth spline surface; return it and its cost."""
+def _refined(start: _Hypothesis, data: LineData, stretch: float = 1.0) -> _Refined:
+    """Refine a quadric, stretched along X, as a smooth spline surface."""
     points = start.model.residuals(start.coefficients, data).point_mm[:, :2]
-    low, high = points.min(axis=0) - MARGIN_MM, points.max(axis=0) + MARGIN_MM
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, half = (low + high) / 2, (high - low) / 2 * np.array([max(STRETCHES), 1.0])
+    low, high = middle - half - MARGIN_MM, middle + half + MARGIN_MM
     basis = SplineBasis.over(low, high, KNOT_MM)
     model = replace(start.model, basis=basis, rays=81)
     x, y = (np.linspace(a, b, 20) for a, b in zip(low, high, strict=True))
     x, y = (each.ravel() for each in np.meshgrid(x, y))
     rows = basis.matrix(x, y)
-    place = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    place = np.stack([middle[0] + (x - middle[0]) / stretch, y, np.zeros_like(x)], axis=-1)
     height, _ = start.model.surface_at(start.coefficients, place)
     rough = _dense(basis.roughness_matrix)
     first: FloatArray = np.asarray(
@@ -326,16 +397,23 @@ def _refined(start: _Hypothesis, data: LineData) -> tuple[LineSurface, float]:
     stiffness = rough / (JERK**2 * CORRELATED_MM2)
     coefficients, covariance, cost, linear = _fit_splines(model, first, data, stiffness)
     agrees = np.abs(linear.residual) <= AGREES
+    agrees = agrees if agrees.sum() > 3 else np.ones_like(agrees)
+    point, aside = linear.point_mm[agrees], linear.aside[agrees]
+    wider = aside[np.argmax(point[:, 0])] - aside[np.argmin(point[:, 0])]
     surface = LineSurface(
         SplineSurface(basis, coefficients),
         covariance,
         np.rint(start.numbers).astype(np.int64),
-        linear.point_mm[agrees] if agrees.sum() > 3 else linear.point_mm,
+        point,
         float(np.sum(_cauchy(linear.residual))) / max(len(linear.residual) - 8, 1),
         np.inf,
         "profile",
+        float(np.sqrt(wider @ covariance @ wider)),
     )
-    return surface, cost
+    # On average c·S·c of the prior equals the number of parameters that the data determine.
+    bends = float(coefficients @ stiffness @ coefficients)
+    settled = len(coefficients) - float(np.sum(stiffness * covariance))
+    return _Refined(surface, cost, bends <= settled, start)
 
 
 def _cauchy(residual: FloatArray) -> FloatArray:

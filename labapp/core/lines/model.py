@@ -82,11 +82,15 @@ class Linearized(ReadOnlyArrays):
         Derivatives of the prediction w.r.t. the coefficients, over the same, (n + m, p), mm⁻¹.
     point_mm
         Intersection of the surface with the ray nearest to each point and end, (n + m, 3), mm.
+    aside
+        Derivatives of the x of these intersections w.r.t. the coefficients, (n + m, p): the ray
+        nearest to a point is another one on another surface.
     """
 
     residual: FloatArray
     jacobian: FloatArray
     point_mm: FloatArray
+    aside: FloatArray
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,7 @@ class LineModel:
         fan = np.clip(fan + np.clip(ahead, -step, step), curves.fan[0], curves.fan[-1])
         point, direction, slope = self._meet(coefficients, number, fan)
         plane = self._land(point, direction, slope)
-        rate, rise = self._rates(coefficients, number, fan)
+        rate, move = self._rates(coefficients, number, fan)
         by_height, by_slope = self._derivatives(coefficients, point, direction, slope)
         cells = self.basis.cells(point[:, 0], point[:, 1])
         value, slope_x, slope_y = cells.value_and_slopes()
@@ -152,30 +156,35 @@ class LineModel:
         # A higher surface meets the ray earlier, which changes the rise of the intersection.
         descent = np.minimum(direction[:, 2] - np.vecdot(slope, direction[:, :2]), -0.05)
         rises = (direction[:, 2] / descent)[:, None] * value
+        inside = np.abs(fan) < curves.fan[-1] - 1e-6
+        turn = np.where(inside, -1.0, 0.0) / np.maximum(np.vecdot(rate, rate), 1e-6)
+        aside = (move[:, 0] * turn)[:, None] * (rate[:, :, None] * change).sum(axis=1)
+        aside += (direction[:, 0] / descent)[:, None] * value
         ends = slice(count, None)
         residual[ends], local[ends] = _end_equations(
             data=data,
-            at_fan=np.abs(fan[ends]) >= curves.fan[-1] - 1e-6,
+            at_fan=~inside[ends],
             height=point[ends, 2],
             off=off[ends],
             rate=rate[ends],
-            rise=rise[ends],
+            rise=move[ends, 2],
             rises=rises[ends],
             change=change[ends],
         )
-        jacobian = np.zeros((len(line), self.basis.count))
+        jacobian, moved = np.zeros((2, len(line), self.basis.count))
         np.put_along_axis(jacobian, cells.splines, local, axis=1)
-        return Linearized(np.nan_to_num(residual, nan=1e3), jacobian, point)
+        np.put_along_axis(moved, cells.splines, aside, axis=1)
+        return Linearized(np.nan_to_num(residual, nan=1e3), jacobian, point, moved)
 
     def _rates(
         self, coefficients: FloatArray, number: FloatArray, fan: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of plane position, (n, 2), and z, (n,), w.r.t. the fan angle, mm/rad."""
+        """Derivatives of position on plane, (n, 2), and surface, (n, 3), by fan angle, mm/rad."""
         before, after = (
             self._meet(coefficients, number, fan + sign * FAN_STEP) for sign in (-1.0, 1.0)
         )
         rate = (self._land(*after) - self._land(*before)) / (2 * FAN_STEP)
-        return np.nan_to_num(rate), (after[0][:, 2] - before[0][:, 2]) / (2 * FAN_STEP)
+        return np.nan_to_num(rate), (after[0] - before[0]) / (2 * FAN_STEP)
 
     def _meet(
         self, coefficients: FloatArray, number: FloatArray, fan: FloatArray

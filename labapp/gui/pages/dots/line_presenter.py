@@ -180,8 +180,8 @@ def _rows(found: LineFrame) -> tuple[ResultRow, ...]:
         rows += [
             ResultRow("Pool height", surface.height_mm, surface.height_sigma_mm, "mm",
                       note="Under the lines; negative for a hollow. ± without the set-up's part"),
-            ResultRow("Pool width", surface.width_mm, unit="mm",
-                      note="Between the ends of the lines"),
+            ResultRow("Pool width", surface.width_mm, surface.width_sigma_mm, "mm",
+                      note="Between the ends of the lines. ± without the set-up's part"),
             ResultRow("Misfit", surface.misfit, decimals=2,
                       note="χ² of points and ends over its degrees of freedom"),
         ]  # fmt: skip

@@ -130,10 +130,11 @@ def line_size_rows(found: LineFrame) -> tuple[ResultRow, ...]:
         return ()
     x, y, z = surface.peak_mm.tolist()
     under = f"At X {x:.2f}, Y {y:.2f} mm, under the lines; ± has no part by the set-up"
+    between = "Between the ends of the lines; ± has no part by the set-up"
     name = "Height" if z >= 0 else "Depth"
     return (
         ResultRow(name, z, surface.height_sigma_mm, "mm", note=under),
-        ResultRow("Width", surface.width_mm, unit="mm", note="Between the ends of the lines"),
+        ResultRow("Width", surface.width_mm, surface.width_sigma_mm, "mm", note=between),
     )
 
 
