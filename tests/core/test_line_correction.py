@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -128,6 +130,47 @@ def test_two_pieces_of_a_line_give_the_same_surface(picture: np.ndarray, found: 
     assert whole is not None
     assert result.surface.numbers.tolist() == [1, 2, 3, 3, 4, 5]
     assert result.surface.height_mm == pytest.approx(whole.height_mm, rel=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hidden", [1, 2])
+def test_a_hidden_line_leaves_its_number_free(
+    picture: np.ndarray, found: LineCorrection, hidden: int
+):
+    result = measured(picture, delete_line(found, hidden))
+    assert result.status == "ok"
+    assert result.surface is not None
+    assert result.surface.numbers.tolist() == [n for n in range(1, 6) if n != hidden + 1]
+    assert result.surface.height_mm == pytest.approx(0.3, rel=0.05)
+
+
+def test_a_line_may_be_missing_only_where_two_are_far_apart():
+    seen = five().seen
+    assert [each.tolist() for each in seen.steps(5)] == [[0, 1, 2, 3, 4]]
+    fewer = delete_line(five(), 2).seen
+    assert [each.tolist() for each in fewer.steps(5)] == [[0, 1, 2, 3], [0, 1, 3, 4]]
+    wider = tuple(straight(500.0 - v) for v in (0, 40, 91, 176))  # a steep pool spreads them
+    assert [each.tolist() for each in LinesSeen(wider, True, False, 0).steps(5)] == [[0, 1, 2, 3]]
+
+
+def test_a_fringe_on_one_side_gives_the_numbers():
+    lines = five().seen.lines[:4]
+
+    def firsts(below: bool, above: bool) -> list[int]:
+        return list(LinesSeen(lines, below, above, 0).first_numbers(5, 4, same_order=True))
+
+    assert firsts(True, False) == [1]
+    assert firsts(False, True) == [2]
+    assert firsts(False, False) == firsts(True, True) == [1, 2]  # one of them is no fringe
+
+
+@pytest.mark.parametrize(("u_px", "fringe"), [((100, 300), True), ((150, 190), False)])
+def test_a_piece_of_a_line_is_no_fringe(u_px: tuple[int, int], fringe: bool):
+    lines = five().seen.lines[:4]
+    faint = replace(straight(340.0, u_px), light=15.0)
+    seen = number_lines((*lines, faint), 5)
+    assert len(seen.lines) == 4
+    assert (seen.fringe_below, seen.fringe_above) == (False, fringe)
 
 
 @pytest.mark.slow

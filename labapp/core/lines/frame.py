@@ -151,12 +151,15 @@ def _numberings(seen: LinesSeen, by_hand: IntArray, count: int) -> list[FloatArr
         return [by_hand.astype(float)]
     given = by_hand > 0
     same = given[1:] & (np.diff(by_hand) == 0)  # pieces of one line
-    steps = np.concatenate([[0.0], np.cumsum(~same)])
+    pieces = np.concatenate([[0], np.cumsum(~same)])
     runs = [
-        first + sign * steps
+        (first + sign * steps).astype(float)
+        for steps in ([pieces] if same.any() else seen.steps(count))
         for sign in (1, -1)
         for first in (
-            range(1, count + 1) if given.any() else seen.first_numbers(count, same_order=sign > 0)
+            range(1, count + 1)
+            if given.any()
+            else seen.first_numbers(count, int(steps[-1]) + 1, same_order=sign > 0)
         )
     ]
     return [

@@ -14,7 +14,7 @@ import numpy as np
 
 from labapp.core.lines.detection.chains import is_upright
 from labapp.core.lines.detection.find_lines import LightLine
-from labapp.core.values import FloatArray
+from labapp.core.values import FloatArray, IntArray
 
 FRINGE_LIGHT, FRINGE_TOTAL = 0.45, 0.4
 """A fringe is fainter than this share of its inner neighbour: per length, and in total."""
@@ -29,8 +29,14 @@ widths of each other belong to one such line."""
 LEAST_TOTAL = 0.06
 """A line of the pattern has at least this share of its inner neighbour's total light."""
 
-NEAREST, FARTHEST = 0.3, 2.5
-"""Range of a fringe's distance from the adjacent line, in units of the line spacing."""
+NEAREST, FARTHEST, FRINGE_LENGTH = 0.3, 1.6, 0.5
+"""Range of a fringe's distance from the adjacent line, in units of the line spacing, and its least
+length, as a share of that line's. Beyond a line that is missing, the fringe is twice as far; pieces
+of a line that is not found as a whole are shorter."""
+
+WIDE = 1.6
+"""A line may be missing between neighbours that are farther apart than this multiple of what the
+distances beside theirs, on a straight line, predict."""
 
 
 @dataclass(frozen=True)
@@ -53,18 +59,38 @@ class LinesSeen:
     fringe_above: bool
     left_out: int
 
-    def first_numbers(self, count: int, same_order: bool) -> range:
+    def steps(self, count: int) -> list[IntArray]:
+        """Possible distances of the lines from the lowest in a pattern of ``count``, each (k,).
+
+        They are 0, 1, … unless a line may be missing where two are far apart.
+        """
+        steps = np.arange(len(self.lines))
+        if not 3 < len(steps) < count:
+            return [steps]
+        apart = np.diff(heights(self.lines))
+        wide = [k for k in range(len(apart)) if apart[k] > WIDE * _predicted(apart, k)]
+        return [steps, *(steps + (steps > k) for k in wide)]
+
+    def first_numbers(self, count: int, span: int, same_order: bool) -> range:
         """Possible numbers of the lowest line in a pattern of ``count`` lines.
 
-        With ``same_order`` numbers increase upwards, as for a flat or convex pool, otherwise
-        downwards. A visible fringe determines the number.
+        ``span`` of them are from the lowest to the highest line. With ``same_order`` numbers
+        increase upwards, as for a flat or convex pool, otherwise downwards. A fringe on one side
+        determines the number; on both sides of too few lines, one of them is no fringe.
         """
-        missing = count - len(self.lines)
-        low = 0 if self.fringe_below or not self.fringe_above else missing
-        high = 0 if self.fringe_below else missing
+        missing = count - span
+        low = missing if self.fringe_above and not self.fringe_below else 0
+        high = 0 if self.fringe_below and not self.fringe_above else missing
         if same_order:
             return range(1 + low, 2 + high)
         return range(count - high, count - low + 1)
+
+
+def _predicted(apart: FloatArray, k: int) -> float:
+    """Distance of line k from the next as predicted from the nearest others, at most three, px."""
+    others = sorted(set(range(len(apart))) - {k}, key=lambda j: abs(j - k))[:3]
+    straight = np.polyfit(others, apart[others], min(1, len(others) - 1))
+    return float(max(np.polyval(straight, k), apart[others].min()))
 
 
 def number_lines(lines: tuple[LightLine, ...], count: int) -> LinesSeen:
@@ -89,8 +115,8 @@ def number_lines(lines: tuple[LightLine, ...], count: int) -> LinesSeen:
         real = real[start : start + count]
     return LinesSeen(
         tuple(ordered[k] for k in real),
-        _is_fringe(height, real, -1),
-        _is_fringe(height, real, 1),
+        _is_fringe(ordered, height, real, -1),
+        _is_fringe(ordered, height, real, 1),
         len(lines) - len(real),
     )
 
@@ -132,11 +158,13 @@ def _pattern_lines(light: FloatArray, total: FloatArray, brightest: int) -> list
     return sorted(real)
 
 
-def _is_fringe(height: FloatArray, real: list[int], side: int) -> bool:
-    """Whether the neighbour of the outermost line is at a fringe's distance from it."""
+def _is_fringe(lines: list[LightLine], height: FloatArray, real: list[int], side: int) -> bool:
+    """Whether the neighbour of the outermost line has a fringe's distance from it and length."""
     outer, inner = (real[0], real[1:2]) if side < 0 else (real[-1], real[-2:-1])
     beside = outer + side
     if not 0 <= beside < len(height):
+        return False
+    if lines[beside].length_px < FRINGE_LENGTH * lines[outer].length_px:
         return False
     if not inner:
         return True
