@@ -8,19 +8,11 @@ from numba import types
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
 from labapp.core.images.dots import Grey
+from labapp.core.union_find_kernels import root
 from labapp.core.values import FloatArray, IntArray
 
 _grey = types.Array(types.float32, 2, "C", readonly=True)
 _ints = types.Array(types.int64, 1, "A", readonly=True)
-
-
-@_inner
-def _root(parent: IntArray, k: int) -> int:
-    """First member of the region of a pixel; the ways to it become shorter."""
-    while parent[k] != k:
-        parent[k] = parent[parent[k]]
-        k = parent[k]
-    return k
 
 
 @_inner
@@ -66,7 +58,7 @@ def prominences(band: Grey, low: Grey, x: IntArray, y: IntArray) -> FloatArray:
         for beside in rank[v : v + 3, u : u + 3].flat:
             if beside < 0:
                 continue
-            own, other = _root(parent, k), _root(parent, beside)
+            own, other = root(parent, k), root(parent, beside)
             if own != other:
                 lower = max(own, other)
                 parent[lower] = min(own, other)

@@ -10,7 +10,8 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled, inner
-from labapp.core.rows.lattice_kernels import first_right_of, root
+from labapp.core.rows.lattice_kernels import first_right_of
+from labapp.core.union_find_kernels import root
 from labapp.core.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 BETWEEN = 0.45

@@ -11,6 +11,7 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled, inner
+from labapp.core.union_find_kernels import root
 from labapp.core.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 BORDER = 3
@@ -164,15 +165,6 @@ def _seed_claims(
         if dot >= 0 and distance < SEED_GATE * abs(step):
             queue.append((len(queue) - 5.0, middle + dk, middle + dt, dot))
     return queue
-
-
-@inner
-def root(parent: IntArray, dot: int) -> int:
-    """The root of a dot's tree (union-find)."""
-    while parent[dot] != dot:
-        parent[dot] = parent[parent[dot]]
-        dot = parent[dot]
-    return dot
 
 
 @inner
