@@ -112,19 +112,19 @@ def test_fringes_are_excluded_and_determine_the_numbers():
     assert numbered.fringe_below
     assert numbered.fringe_above
     assert numbered.left_out == 2
-    assert list(numbered.first_numbers(3, same_order=True)) == [1]
-    assert list(numbered.first_numbers(3, same_order=False)) == [3]
+    assert list(numbered.first_numbers(3, 3, same_order=True)) == [1]
+    assert list(numbered.first_numbers(3, 3, same_order=False)) == [3]
 
 
 def test_missing_lines_make_numbers_ambiguous_without_a_fringe():
     alone = number_lines(find_lines(drawn(*five(50.0, 55.0, 60.0))), 5)
-    assert list(alone.first_numbers(5, same_order=True)) == [1, 2, 3]
-    assert list(alone.first_numbers(5, same_order=False)) == [3, 4, 5]
+    assert list(alone.first_numbers(5, 3, same_order=True)) == [1, 2, 3]
+    assert list(alone.first_numbers(5, 3, same_order=False)) == [3, 4, 5]
     above = number_lines(find_lines(drawn(*five(50.0, 55.0, 60.0, 10.0))), 5)
-    assert list(above.first_numbers(5, same_order=True)) == [3]
+    assert list(above.first_numbers(5, 3, same_order=True)) == [3]
     below = number_lines(find_lines(drawn(*five(9.0, 55.0, 60.0, 50.0))), 5)
-    assert list(below.first_numbers(5, same_order=True)) == [1]
-    assert list(below.first_numbers(5, same_order=False)) == [5]
+    assert list(below.first_numbers(5, 3, same_order=True)) == [1]
+    assert list(below.first_numbers(5, 3, same_order=False)) == [5]
 
 
 def test_empty_frame_has_no_line():
