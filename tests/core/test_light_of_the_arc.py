@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 import pytest
 
@@ -84,6 +85,19 @@ def test_a_few_large_dots_are_found_where_nothing_else_is() -> None:
     image = image.astype(np.float32)
     assert tuning_of(image, BandPassSettings()).size_px == pytest.approx(9.0, rel=0.15)
     assert far(at, band_pass_dots(image, BandPassSettings()).image_px) == 0
+
+
+def test_saturated_dots_of_a_dense_grid_are_found() -> None:
+    u, v = np.meshgrid(np.arange(60.0, 580.0, 17.0), np.arange(60.0, 420.0, 17.0))
+    grid = np.stack([u.ravel(), v.ravel()], axis=-1)
+    y, x = np.indices(SHAPE)
+    light = np.full(SHAPE, 20.0)
+    for at in grid:
+        light[np.hypot(x - at[0], y - at[1]) <= 7.0] = 700.0
+    light = cv2.GaussianBlur(light, (0, 0), 1.0) + np.random.default_rng(3).normal(0.0, 1.5, SHAPE)
+    image = np.clip(np.rint(light), 0, 255).astype(np.uint8)
+    found = band_pass_dots(image, BandPassSettings()).image_px
+    assert far(grid, found) == far(found, grid) == 0
 
 
 def test_prominence_is_the_height_over_the_saddle_to_a_higher_peak() -> None:
