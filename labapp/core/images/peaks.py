@@ -144,7 +144,7 @@ class BandPassed:
     def peaks(self, tuning: DetectorTuning, are_crowded: bool = False) -> Peaks:
         """Return the peaks above the threshold that may be dots.
 
-        Of crowded dots peaks on a ridge are included, too: such dots overlap.
+        Of crowded dots peaks on a ridge or in saturated light are included, too: such dots overlap.
 
         Peaks as sharp as hot pixels or as elongated as lines of them are suspect. Their pixels
         are repaired, since a dot of usual brightness may lie beneath them.
@@ -186,7 +186,7 @@ class BandPassed:
         if not are_crowded:
             prominence = prominence_kernels.prominences(band, low, u // step, v // step)
             over &= prominence > np.minimum(PROMINENT * floor, PROMINENT_SHARE * bright)
-        over &= ~self._is_saturated(u, v)
+            over &= ~self._is_saturated(u, v)
         return u[over], v[over], bright[over]
 
     def _is_saturated(self, u: IntArray, v: IntArray) -> BoolArray:
