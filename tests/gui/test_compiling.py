@@ -19,10 +19,11 @@ PACKAGE = Path(labapp.__file__).parent
 
 
 def test_every_compiled_module_is_listed():
+    compiled = r"^from labapp\.core\.compiled import .*\b(compiled|inner)"
     modules = {
         ".".join(("labapp", *file.relative_to(PACKAGE).with_suffix("").parts))
         for file in PACKAGE.rglob("*.py")
-        if re.search(r"^from labapp\.core\.compiled import .*\bcompiled", file.read_text(), re.M)
+        if re.search(compiled, file.read_text(), re.M)
     }
     assert modules == set(compiling.COMPILED)
 
