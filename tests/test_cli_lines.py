@@ -95,6 +95,7 @@ def test_frames_are_measured_into_tables(labapp: Run, setup: Path, tmp_path: Pat
     assert "width_mm" not in features[0]  # of the pool, in other tables
     assert float(features[0]["plane_width_mm"]) > 10.0
     assert [row["setup_status"] for row in features] == ["entered", "entered"]
+    assert [row["numbered"] for row in features] == ["1", ""]
     lines = rows(out / "lines.csv")
     assert [row["number"] for row in lines] == ["1", "2", "3", "4", "5"]
     points = rows(out / "line_points.csv")

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.lines.fit import LineSurface
 from labapp.core.lines.frame import LineFrame
 from labapp.core.lines.metal import PoolEdges
 from labapp.core.lines.states import LineSeries, State, line_states
+from labapp.core.lines.surface import LineSurface
 from labapp.export.frame_result import FrameResult
 from labapp.text import csv_text
 
@@ -27,9 +27,11 @@ FEATURE_COLUMNS = (
     "plane_curvature_per_mm", "plane_asymmetry", "pool_height_mm",
     "pool_height_sigma_mm", "pool_width_mm", "pool_curvature_per_mm", "misfit", "margin",
     "setup_status", "pool_width_sigma_mm", "pool_curvature_sigma_per_mm",
+    "numbered",
 )  # fmt: skip
 """``plane_…`` are quantities of the lines on the imaging plane. ``pool_…_sigma_…`` do not include
-the set-up, unlike ``…_sigma_mm`` of dots; ``setup_status`` is its reliability."""
+the set-up, unlike ``…_sigma_mm`` of dots; ``setup_status`` is its reliability. ``numbered`` is 0 if
+other numbers of the lines agree as well: the surface may lie elsewhere along Y."""
 TRACK_COLUMNS = (
     "frame", "time_s", "pulse", "pulse_probability", "followed", "shift_px", "tilt_px", "bend_px",
     "agreeing_share",
@@ -78,7 +80,7 @@ def line_rows(frame: int, found: LineFrame, calibration: ImageCalibration) -> li
 def _numbers(found: LineFrame) -> list[str]:
     """Return the number of each line in the pattern; empty if undetermined."""
     lines = found.seen.lines
-    if found.status != "ok" or found.surface is None:
+    if found.status != "ok" or found.surface is None or not found.surface.numbered:
         return [""] * len(lines)
     known = iter(found.surface.numbers.tolist())
     return ["" if one.folded else str(next(known)) for one in lines]
@@ -120,6 +122,7 @@ def feature_rows(
                 *map(_cell, measured),
                 setup_status,
                 *map(_cell, sigma),
+                "" if surface is None else str(int(surface.numbered)),
             ]
         )
     return rows

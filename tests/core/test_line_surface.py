@@ -144,14 +144,60 @@ def first_lines(data: LineData, count: int) -> LineData:
     ("numberings", "status"),
     [
         pytest.param([[1, 2, 3, 4]], "ok", id="known"),
-        pytest.param([[1, 2, 3, 4], [2, 3, 4, 5]], "profile", id="or-their-neighbours"),
         pytest.param([[5, 4, 3, 2]], "profile", id="wrong-order"),
+        pytest.param([[1, 2, 3, 4], [5, 4, 3, 2]], "ok", id="clear-order"),
     ],
 )
-def test_four_of_five_lines_need_their_numbers(numberings: list[list[int]], status: str):
+def test_four_of_five_lines_need_their_order(numberings: list[list[int]], status: str):
     data, _ = exact_data(rendered(egg(6.0, 2.8, 3.2, 0.3)), sigma_mm=0.02)
     four = [np.array(numbers, float) for numbers in numberings]
-    assert fit_lines(first_lines(data, 4), four, RIG).status == status
+    fitted = fit_lines(first_lines(data, 4), four, RIG)
+    assert fitted.status == status
+    assert fitted.numbered
+
+
+@pytest.mark.slow
+def test_numbers_that_give_the_same_height_are_left_open():
+    """A surface moved along Y by the distance of the lines reflects nearly the same four lines."""
+    frame = rendered(egg(6.0, 2.8, 3.2, 0.3))
+    four = first_lines(exact_data(frame, sigma_mm=0.02)[0], 4)
+    either = [np.array([1.0, 2, 3, 4]), np.array([2.0, 3, 4, 5])]
+    alone = [fit_lines(four, [numbers], RIG) for numbers in either]
+    fitted = fit_lines(four, either, RIG)
+    assert fitted.status == "ok"
+    assert not fitted.numbered
+    apart = abs(alone[0].height_mm - alone[1].height_mm)
+    own = min(one.height_sigma_mm for one in alone)
+    assert fitted.height_sigma_mm > 0.99 * np.hypot(own, apart) > own
+    point = np.concatenate([one.point_mm for one in frame.lines if one.number < 5])
+    assert abs(fitted.height_mm - point[:, 2].max()) < 2.5 * fitted.height_sigma_mm
+    low, high = (one.surface.height(*point[:, :2].T) for one in alone)
+    both = np.isfinite(low + high)
+    assert both.mean() > 0.8
+    sigma = fitted.sigma_mm(*point[both, :2].T)
+    assert (sigma > 0.9 * np.abs(low - high)[both]).all()
+    assert fitted.curvature_sigma_per_mm > alone[0].curvature_sigma_per_mm
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("peak_mm", [0.18, 0.22])
+def test_small_steep_pool_bends_more(peak_mm: float):
+    frame = rendered(egg(4.4, 1.4, 2.2, peak_mm))
+    data, numbers = exact_data(frame, sigma_mm=0.02)
+    fitted = fit_lines(data, [numbers, numbers[::-1]], RIG)
+    assert fitted.status == "ok"
+    height = np.concatenate([one.point_mm for one in frame.lines])[:, 2].max()
+    assert abs(fitted.height_mm - height) < 2.5 * fitted.height_sigma_mm
+
+
+@pytest.mark.slow
+def test_numbers_that_give_another_height_leave_a_profile(monkeypatch: pytest.MonkeyPatch):
+    four = first_lines(exact_data(rendered(egg(6.0, 2.8, 3.2, 0.3)), sigma_mm=0.02)[0], 4)
+    either = [np.array([1.0, 2, 3, 4]), np.array([2.0, 3, 4, 5])]
+    monkeypatch.setattr("labapp.core.lines.fit.ALIKE_HEIGHT", (0.0, 0.0))
+    fitted = fit_lines(four, either, RIG)
+    assert fitted.status == "profile"
+    assert fitted.numbered
 
 
 def test_single_line_raises_too_few_lines():

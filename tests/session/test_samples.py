@@ -78,10 +78,13 @@ def test_line_session_is_intact_and_near_the_truth(name: str):
         trend = line_trend(session)
         height = trend.values["pool_height_mm"]
         is_known = np.isfinite(height)
-        assert is_known.mean() > 0.6
-        error = height / (truth(name, "height_mm") + truth(name, "depth_mm")) - 1
-        assert np.median(np.abs(error[is_known])) < 0.08
-        assert np.abs(error[is_known]).max() < 0.25
+        true = truth(name, "height_mm") + truth(name, "depth_mm")
+        assert is_known.mean() > 0.45
+        assert {-1, 1} == set(np.sign(true[is_known]))
+        error = height / true - 1
+        assert np.median(np.abs(error[is_known])) < 0.03
+        assert np.abs(error[is_known]).max() < 0.15
+        assert (np.abs(height - true)[is_known] < 2.5 * trend.height_sigma_mm[is_known]).all()
         is_right = [a == b for a, b in zip(trend.states, texts(name, "state"), strict=True)]
         assert np.mean(is_right) > 0.9
 

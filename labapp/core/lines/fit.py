@@ -8,8 +8,8 @@ are refined as splines with a smoothness prior.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import scipy
@@ -17,9 +17,10 @@ import scipy
 from labapp.core.geometry.line_pattern import LineRig, line_directions
 from labapp.core.geometry.optics import intersect_level
 from labapp.core.lines.model import Linearized, LineData, LineModel
+from labapp.core.lines.surface import LineSurface, quadric_terms
 from labapp.core.surface.pool_fit import CORRELATED_MM2
 from labapp.core.surface.spline import SplineBasis, SplineSurface
-from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import CannotMeasure, FloatArray
 
 RADII_MM = (6.0, 9.0, 14.0, 24.0, 45.0, 120.0)
 """Initial radii of curvature of the quadrics, convex and concave."""
@@ -40,6 +41,10 @@ many of each order of the lines."""
 QUADRIC_ROUNDS, SPLINE_ROUNDS = 20, 20
 MARGIN_MM = 0.8
 
+ALIKE_HEIGHT = 0.05, 2.0
+"""Heights that differ by no more than this share of the second, plus this many times its standard
+uncertainty, are those of one solution."""
+
 STRETCHES, ALIKE_COST = (0.7, 1.25), 12.0
 """Factors by which the quadric is made narrower and wider for two more fits, and largest additional
 cost of a surface that counts. Pools of different widths reflect nearly the same lines, as the
@@ -55,111 +60,22 @@ LEAST_LINES = 3
 KNOT_MM = 0.9
 """Spacing of the spline knots, mm."""
 
-JERK = 0.03
-"""Expected third derivatives of the surface, mm⁻². With 0.005 the lines fit equally well, but the
-height of hollow pools is 3 % too large, more than its ±."""
+JERK, MOST_JERK, JERK_SHARE = 0.03, 0.12, 3.0
+"""Expected third derivatives of the surface, mm⁻²: least and most, and as a multiple of height over
+half width cubed, since small steep pools have larger ones. With 0.005 the lines fit equally well,
+but the height of hollow pools is 3 % too large, more than its ±."""
 
 SETTLED = 0.05
 """The iteration stops if a step reduces the cost by less."""
 
 LEAST_MARGIN, NUMBERS_MARGIN = 6.0, 0.5
 """Least difference of the cost of another sign, height or numbering from the best; for another
-numbering, plus this share of the best: it may fit worse only as a line is found worse."""
+numbering, plus this share of the best: it may fit worse only as a line is found worse. Another
+numbering within this difference must give the same height."""
 
 MOST_RELATIVE_SIGMA, MOST_MISFIT = 0.1, 0.35
 """Largest relative standard uncertainty of a height that is determined, and largest χ² over its
 degrees of freedom of a surface that fits."""
-
-
-@dataclass(frozen=True)
-class LineSurface(ReadOnlyArrays):
-    """A surface fitted to the reflected lines, and its uncertainty.
-
-    Parameters
-    ----------
-    surface
-        The surface, z = 0 at the boundary.
-    covariance
-        Covariance of its coefficients, shape (p, p), mm². It includes the differences from the
-        surfaces of other widths that agree as well with the lines.
-    numbers
-        Number of each line in the pattern, from the lowest in the picture up, shape (k,).
-    point_mm
-        Points of the surface met by the rays of the points and ends that agree with it, shape
-        (n, 3), mm.
-    misfit
-        χ² of points and ends over its degrees of freedom.
-    margin
-        Additional cost of the next best sign or height; infinite if there is none.
-    status
-        ``ok``, or ``profile`` if the lines do not fully determine the surface: its heights are then
-        not a measurement, although slopes along the lines may be.
-    width_sigma_mm
-        Standard uncertainty of `width_mm`, mm.
-    """
-
-    surface: SplineSurface
-    covariance: FloatArray
-    numbers: IntArray
-    point_mm: FloatArray
-    misfit: float
-    margin: float
-    status: str
-    width_sigma_mm: float = float("nan")
-
-    @cached_property
-    def peak_mm(self) -> FloatArray:
-        """(x, y, z) of the highest point under the lines, or of the lowest of a hollow, mm."""
-        low, high = self.point_mm[:, :2].min(axis=0), self.point_mm[:, :2].max(axis=0)
-        x, y = (np.linspace(*ends, 81) for ends in zip(low, high, strict=True))
-        x, y = (each.ravel() for each in np.meshgrid(x, y))
-        z = self.surface.height(x, y)
-        best = int(np.argmax(np.nan_to_num(np.abs(z))))
-        return np.array([x[best], y[best], z[best]])
-
-    @property
-    def height_mm(self) -> float:
-        """Height of the highest point, or negative depth of the lowest one, mm."""
-        return float(self.peak_mm[2])
-
-    @cached_property
-    def height_sigma_mm(self) -> float:
-        """Standard uncertainty of `height_mm`, mm."""
-        return float(self.sigma_mm(*self.peak_mm[:2, None])[0])
-
-    def sigma_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Standard uncertainty of the height at points, each shape (n,), mm."""
-        rows = self.surface.basis.matrix(x_mm, y_mm)
-        return np.asarray(np.sqrt(np.maximum(np.vecdot(rows @ self.covariance, rows), 0.0)))
-
-    @property
-    def bulges(self) -> bool:
-        """Whether height and curvature agree: convex above the work piece, concave below it."""
-        return self.height_mm * self.curvature_per_mm > 0
-
-    @property
-    def width_mm(self) -> float:
-        """Width of the pool along X, between the ends of the lines, mm."""
-        return float(np.ptp(self.point_mm[:, 0]))
-
-    @property
-    def curvature_per_mm(self) -> float:
-        """Mean curvature of the least-squares quadric of the surface, 1/mm; positive if convex."""
-        return float(self._curvature @ self.surface.coefficients)
-
-    @property
-    def curvature_sigma_per_mm(self) -> float:
-        """Standard uncertainty of `curvature_per_mm`, 1/mm."""
-        return float(np.sqrt(self._curvature @ self.covariance @ self._curvature))
-
-    @cached_property
-    def _curvature(self) -> FloatArray:
-        """Derivatives of the mean curvature w.r.t. the coefficients, shape (p,), mm⁻²."""
-        x, y = self.point_mm[:, :2].T
-        known = np.isfinite(self.surface.height(x, y))  # a ray may leave the splines' domain
-        x, y = x[known], y[known]
-        quadric = np.linalg.pinv(_monomials(x - x.mean(), y - y.mean()))
-        return np.asarray(-(quadric[3] + quadric[5]) @ self.surface.basis.matrix(x, y))
 
 
 @dataclass(frozen=True)
@@ -207,16 +123,22 @@ def fit_lines(data: LineData, numberings: list[FloatArray], rig: LineRig) -> Lin
         key=lambda one: one.cost,
     )
     near, others = _near(tried)
-    refined = sorted((_refined(one, data) for one in near), key=lambda one: one.cost)
+    refined, jerk = _all_refined(near, data, JERK), JERK
+    if not refined[0].smooth:
+        jerk = _jerk_of(refined[0].surface)
+        refined = _all_refined(near, data, jerk)
     best = refined[0]
     others += [one.cost - best.cost for one in refined[1:] if _differ(one.surface, best.surface)]
     margin = min(others, default=np.inf)
     least = LEAST_MARGIN + NUMBERS_MARGIN * best.cost
-    numbered = all(one.cost - best.cost >= least for one in refined[1:])
-    if numbered and _is_determined(best, margin):
-        best = _of_widths(best, data)
-    status = "ok" if numbered and _is_determined(best, margin) else "profile"
-    return replace(best.surface, margin=margin, status=status)
+    rivals = [one for one in refined[1:] if one.cost - best.cost < least]
+    determined = _is_determined(best, margin, rivals)
+    if determined:
+        best, *rivals = (_of_widths(one, data, jerk) for one in (best, *rivals))
+        determined = _is_determined(best, margin, rivals)
+        best = _of_numbers(best, rivals)
+    determined = determined and _is_sure(best.surface)
+    return replace(best.surface, margin=margin, status="ok" if determined else "profile")
 
 
 def _near(tried: list[_Hypothesis]) -> tuple[list[_Hypothesis], list[float]]:
@@ -234,18 +156,34 @@ def _near(tried: list[_Hypothesis]) -> tuple[list[_Hypothesis], list[float]]:
     return near, others
 
 
-def _is_determined(one: _Refined, margin: float) -> bool:
-    """Whether the lines determine the surface: see the statuses of `LineSurface`."""
-    surface = one.surface
-    sure = surface.height_sigma_mm <= MOST_RELATIVE_SIGMA * abs(surface.height_mm)
-    fits = surface.misfit <= MOST_MISFIT and one.smooth
+def _all_refined(near: list[_Hypothesis], data: LineData, jerk: float) -> list[_Refined]:
+    return sorted((_refined(one, data, jerk) for one in near), key=lambda one: one.cost)
+
+
+def _jerk_of(surface: LineSurface) -> float:
+    """Third derivatives expected of a pool of this height and width, mm⁻²."""
+    half = surface.width_mm / 2
+    return float(np.clip(JERK_SHARE * abs(surface.height_mm) / half**3, JERK, MOST_JERK))
+
+
+def _is_determined(best: _Refined, margin: float, rivals: list[_Refined]) -> bool:
+    """Whether the lines determine the surface; ``rivals`` have other numbers and fit as well."""
+    surface = best.surface
+    fits = surface.misfit <= MOST_MISFIT and best.smooth
     enough = len(np.unique(surface.numbers)) >= LEAST_LINES
-    return enough and sure and fits and surface.bulges and margin >= LEAST_MARGIN
+    alike = not any(_differ(one.surface, surface) for one in rivals)
+    return enough and fits and alike and margin >= LEAST_MARGIN and _is_sure(surface)
 
 
-def _of_widths(found: _Refined, data: LineData) -> _Refined:
+def _is_sure(surface: LineSurface) -> bool:
+    """Whether the height is known and agrees with the curvature."""
+    limit = MOST_RELATIVE_SIGMA * abs(surface.height_mm)
+    return surface.bulges and surface.height_sigma_mm <= limit
+
+
+def _of_widths(found: _Refined, data: LineData, jerk: float) -> _Refined:
     """Fit narrower and wider pools, too: return the best, with the others in its uncertainties."""
-    again = [found, *(_refined(found.start, data, stretch) for stretch in STRETCHES)]
+    again = [found, *(_refined(found.start, data, jerk, stretch) for stretch in STRETCHES)]
     best = min(again, key=lambda one: one.cost)
     surface = best.surface
     alike = [one.surface for one in again if one.cost - best.cost < ALIKE_COST]
@@ -260,30 +198,47 @@ def _of_widths(found: _Refined, data: LineData) -> _Refined:
     return replace(best, surface=surface)
 
 
+def _of_numbers(found: _Refined, rivals: list[_Refined]) -> _Refined:
+    """Include the surfaces of other numbers of the lines in the uncertainties."""
+    if not rivals:
+        return found
+    surface = found.surface
+    own = surface.surface
+    away = []
+    for one in rivals:
+        model = replace(one.start.model, basis=one.surface.surface.basis)
+        moved = _in_basis(own.basis, model, one.surface.surface.coefficients)
+        away.append(moved - own.coefficients)
+    higher = np.array([one.surface.height_mm - surface.height_mm for one in rivals])
+    wider = np.array([one.surface.width_mm - surface.width_mm for one in rivals])
+    surface = replace(
+        surface,
+        renumbered=np.stack(away),
+        renumbered_height_mm=float(np.sqrt(np.mean(higher**2))),
+        width_sigma_mm=float(np.hypot(surface.width_sigma_mm, np.sqrt(np.mean(wider**2)))),
+    )
+    return replace(found, surface=surface)
+
+
 def _differ(one: LineSurface, other: LineSurface) -> bool:
     """Whether two surfaces are different solutions."""
     apart = abs(one.height_mm - other.height_mm)
-    return apart > 0.05 * abs(other.height_mm) + 2 * other.height_sigma_mm
+    share, sigmas = ALIKE_HEIGHT
+    return apart > share * abs(other.height_mm) + sigmas * other.height_sigma_mm
 
 
 # --- quadrics -------------------------------------------------------------------------------------
 
 
-def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-
-
-def _quadric_basis(basis: SplineBasis) -> FloatArray:
-    """Spline coefficients of 1, x, y, x², xy, y², shape (p, 6); the representation is exact."""
-    x, y = (
-        np.linspace(low, high, 12) for low, high in zip(basis.low_mm, basis.high_mm, strict=True)
-    )
+def _spline_coefficients(
+    basis: SplineBasis, values: Callable[[FloatArray, FloatArray], FloatArray]
+) -> FloatArray:
+    """Spline coefficients, shape (p, …), of functions of x and y with values (n, …)."""
+    x, y = (np.linspace(*ends, 20) for ends in zip(basis.low_mm, basis.high_mm, strict=True))
     x, y = (each.ravel() for each in np.meshgrid(x, y))
-    rough = _dense(basis.roughness_matrix)
-    rows = basis.matrix(x, y)
-    return np.asarray(
-        np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ _monomials(x, y)), np.float64
-    )
+    rows, rough = basis.matrix(x, y), _dense(basis.roughness_matrix)
+    found = np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ values(x, y))
+    return np.asarray(found, np.float64)
 
 
 def _best_quadric(data: LineData, numbers: FloatArray, rig: LineRig) -> _Hypothesis:
@@ -298,7 +253,7 @@ def _best_quadric(data: LineData, numbers: FloatArray, rig: LineRig) -> _Hypothe
     ground = intersect_level(rig.laser.position_mm, corner).reshape(-1, 3)[:, :2]
     basis = SplineBasis.over(ground.min(axis=0), ground.max(axis=0), KNOT_MM)
     model = LineModel(rig, basis, np.asarray(numbers, float), 41)
-    into = _quadric_basis(basis)
+    into = _spline_coefficients(basis, quadric_terms)  # exact
     softer = replace(
         data,
         sigma_mm=np.hypot(data.sigma_mm, QUADRIC_SIGMA_MM),
@@ -377,7 +332,20 @@ def _dense(band: FloatArray) -> FloatArray:
     return dense + np.tril(dense, -1).T
 
 
-def _refined(start: _Hypothesis, data: LineData, stretch: float = 1.0) -> _Refined:
+def _in_basis(
+    basis: SplineBasis, model: LineModel, coefficients: FloatArray, stretch: float = 1.0
+) -> FloatArray:
+    """Coefficients in another basis of a model's surface, stretched along X about its middle."""
+    middle = (basis.low_mm[0] + basis.high_mm[0]) / 2
+
+    def height(x: FloatArray, y: FloatArray) -> FloatArray:
+        place = np.stack([middle + (x - middle) / stretch, y, np.zeros_like(x)], axis=-1)
+        return model.surface_at(coefficients, place)[0]
+
+    return _spline_coefficients(basis, height)
+
+
+def _refined(start: _Hypothesis, data: LineData, jerk: float, stretch: float = 1.0) -> _Refined:
     """Refine a quadric, stretched along X, as a smooth spline surface."""
     points = start.model.residuals(start.coefficients, data).point_mm[:, :2]
     low, high = points.min(axis=0), points.max(axis=0)
@@ -385,16 +353,8 @@ def _refined(start: _Hypothesis, data: LineData, stretch: float = 1.0) -> _Refin
     low, high = middle - half - MARGIN_MM, middle + half + MARGIN_MM
     basis = SplineBasis.over(low, high, KNOT_MM)
     model = replace(start.model, basis=basis, rays=81)
-    x, y = (np.linspace(a, b, 20) for a, b in zip(low, high, strict=True))
-    x, y = (each.ravel() for each in np.meshgrid(x, y))
-    rows = basis.matrix(x, y)
-    place = np.stack([middle[0] + (x - middle[0]) / stretch, y, np.zeros_like(x)], axis=-1)
-    height, _ = start.model.surface_at(start.coefficients, place)
-    rough = _dense(basis.roughness_matrix)
-    first: FloatArray = np.asarray(
-        np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ height), np.float64
-    )
-    stiffness = rough / (JERK**2 * CORRELATED_MM2)
+    first = _in_basis(basis, start.model, start.coefficients, stretch)
+    stiffness = _dense(basis.roughness_matrix) / (jerk**2 * CORRELATED_MM2)
     coefficients, covariance, cost, linear = _fit_splines(model, first, data, stiffness)
     agrees = np.abs(linear.residual) <= AGREES
     agrees = agrees if agrees.sum() > 3 else np.ones_like(agrees)

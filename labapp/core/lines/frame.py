@@ -13,8 +13,9 @@ from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.data import line_data
 from labapp.core.lines.detection.find_lines import LightLine, find_lines
 from labapp.core.lines.detection.numbering import LinesSeen, number_lines
-from labapp.core.lines.fit import LineSurface, fit_lines
+from labapp.core.lines.fit import fit_lines
 from labapp.core.lines.metal import PoolEdges, pool_edges, without_metal
+from labapp.core.lines.surface import LineSurface
 from labapp.core.lines.track import TrackedLine
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 

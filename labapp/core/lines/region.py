@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from labapp.core.lines.fit import LineSurface
+from labapp.core.lines.surface import LineSurface
 from labapp.core.surface.boundary import POINTS, Boundary
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray

@@ -25,9 +25,9 @@ from labapp.core.images import dots, find_dots, threshold_dots
 from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.detection.find_lines import LightLine
 from labapp.core.lines.detection.numbering import LinesSeen
-from labapp.core.lines.fit import LineSurface
 from labapp.core.lines.frame import LineFeatures, LineFrame
 from labapp.core.lines.metal import PoolEdges
+from labapp.core.lines.surface import LineSurface
 from labapp.core.lines.track import TrackedLine
 from labapp.core.match import Match, Trial
 from labapp.core.matching.match_settings import MatchSettings
@@ -288,7 +288,8 @@ STORED = {
         },
     ),
     "LineSurface": Stored(
-        LineSurface, shapes={"covariance": "p p", "numbers": "k", "point_mm": "n 3"}
+        LineSurface,
+        shapes={"covariance": "p p", "numbers": "k", "point_mm": "n 3", "renumbered": "q r"},
     ),
     "SetupVerdict": Stored(SetupVerdict),
     "Suspect": Stored(ResidualSuspect),

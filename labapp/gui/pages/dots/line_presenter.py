@@ -135,8 +135,9 @@ def _places(number: IntArray) -> list[str]:
 
 def line_names(found: LineFrame, by_hand: IntArray) -> tuple[str, ...]:
     """Name of each line, see `DrawnLine`."""
-    if found.status != "ok" or found.surface is None:
+    if not _is_numbered(found):
         return tuple(_places(by_hand))
+    assert found.surface is not None
     numbers = iter(found.surface.numbers.tolist())
     return tuple(
         (str(given) if given else "–") if one.folded else str(next(numbers))
@@ -144,10 +145,14 @@ def line_names(found: LineFrame, by_hand: IntArray) -> tuple[str, ...]:
     )
 
 
+def _is_numbered(found: LineFrame) -> bool:
+    return found.status == "ok" and found.surface is not None and found.surface.numbered
+
+
 def _words(found: LineFrame) -> str:
     seen = found.seen
     message = _count(seen)
-    if seen.lines and found.status != "ok":
+    if seen.lines and not _is_numbered(found):
         message += ". The lines' numbers are uncertain: counted from the lowest up"
     return f"{message}. {STATUSES.get(found.status, found.reason or found.status)}."
 

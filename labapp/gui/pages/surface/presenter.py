@@ -130,6 +130,8 @@ def line_size_rows(found: LineFrame) -> tuple[ResultRow, ...]:
         return ()
     x, y, z = surface.peak_mm.tolist()
     under = f"At X {x:.2f}, Y {y:.2f} mm, under the lines; ± has no part by the set-up"
+    if not surface.numbered:
+        under += ". The lines can have other numbers: the surface may lie elsewhere along Y"
     between = "Between the ends of the lines; ± has no part by the set-up"
     name = "Height" if z >= 0 else "Depth"
     return (
