@@ -14,9 +14,11 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QHBoxLayout, QWidget
 from pytestqt.qtbot import QtBot
 
+from labapp.export.line_results import line_rows
 from labapp.gui.pages.dots.fitting import Processes, Refit
 from labapp.gui.pages.dots.line_presenter import show_lines
 from labapp.gui.pages.dots.page import DotsPage
+from labapp.gui.pages.surface.presenter import EITHER_NUMBERS, shown
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT, SAMPLES, let_draw
@@ -151,3 +153,28 @@ def test_lines_of_a_frame_have_unique_numbers(tmp_path: Path) -> None:
             assert len(set(numbers)) == len(numbers), frame
             folded += any(line.name == "–" for line in lines)
         assert folded
+
+
+def test_lines_with_open_numbers_have_a_height_and_no_numbers(tmp_path: Path) -> None:
+    shutil.copytree(SAMPLES / "five_lines", tmp_path / "five_lines")
+    with Session.open(tmp_path / "five_lines" / "five_lines.labsession") as session:
+        numbered = {True: 0, False: 0}
+        for frame in range(64):
+            result = session.result(frame)
+            assert result is not None
+            assert result.measurement.lines is not None
+            found = result.measurement.lines
+            if found.status != "ok":
+                continue
+            assert found.surface is not None
+            certain = found.surface.numbered
+            numbered[certain] += 1
+            state = shown(session, frame)
+            assert state.state == "measured"
+            assert (EITHER_NUMBERS in state.words) != certain
+            assert state.sizes[0].name in ("Height", "Depth")
+            names = [line.name for line in show_lines(session, frame).lines]
+            assert any("(" in name for name in names) != certain
+            rows = line_rows(frame, found, session.setup.calibration)
+            assert all((row[2] == "") != certain for row in rows if row[-1] == "0")
+    assert min(numbered.values()) > 3

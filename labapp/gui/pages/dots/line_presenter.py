@@ -154,6 +154,8 @@ def _words(found: LineFrame) -> str:
     message = _count(seen)
     if seen.lines and not _is_numbered(found):
         message += ". The lines' numbers are uncertain: counted from the lowest up"
+        if found.status == "ok":
+            return f"{message}. All possible numbers give the same height."
     return f"{message}. {STATUSES.get(found.status, found.reason or found.status)}."
 
 

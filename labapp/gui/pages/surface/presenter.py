@@ -69,6 +69,12 @@ def with_scheme(settings: Settings, name: str) -> Settings:
     return replace(settings, **changed)  # type: ignore[arg-type]
 
 
+EITHER_NUMBERS = (
+    "The lines can have other numbers, which give the same height: the surface may lie elsewhere "
+    "along Y."
+)
+
+
 @dataclass(frozen=True)
 class Options:
     """Options of the 3-D view chosen by the operator."""
@@ -130,8 +136,6 @@ def line_size_rows(found: LineFrame) -> tuple[ResultRow, ...]:
         return ()
     x, y, z = surface.peak_mm.tolist()
     under = f"At X {x:.2f}, Y {y:.2f} mm, under the lines; ± has no part by the set-up"
-    if not surface.numbered:
-        under += ". The lines can have other numbers: the surface may lie elsewhere along Y"
     between = "Between the ends of the lines; ± has no part by the set-up"
     name = "Height" if z >= 0 else "Depth"
     return (
@@ -185,6 +189,9 @@ def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]
         )
     elif measurement.lines is not None and not failed:
         words = "Measured between the lines; nothing is known of the pool beyond them."
+        surface = measurement.lines.surface
+        if surface is not None and not surface.numbered:
+            words += f" {EITHER_NUMBERS}"
     elif measurement.status == "followed":
         words = "The line is followed, but one line gives no surface. Its motion is in step Trends."
     elif failed:
