@@ -180,6 +180,17 @@ def test_numbers_that_give_the_same_height_are_left_open():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("refined", "status"), [(3, "ok"), (2, "profile")])
+def test_all_possible_numbers_must_give_the_same_height(
+    refined: int, status: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("labapp.core.lines.fit.MOST_REFINED", refined)
+    three = first_lines(exact_data(rendered(egg(4.4, 1.4, 2.2, 0.22)), sigma_mm=0.02)[0], 3)
+    numbers = [np.arange(first, first + 3.0) for first in (1, 2, 3)]
+    assert fit_lines(three, numbers, RIG).status == status
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("peak_mm", [0.18, 0.22])
 def test_small_steep_pool_bends_more(peak_mm: float):
     frame = rendered(egg(4.4, 1.4, 2.2, peak_mm))

@@ -109,7 +109,9 @@ def fit_lines(data: LineData, numberings: list[FloatArray], rig: LineRig) -> Lin
     data
         Points and ends of the lines, on the imaging plane.
     numberings
-        Possible numbers of the lines, from the lowest up, each shape (k,).
+        Possible numbers of the lines, from the lowest up, each shape (k,). If several agree with
+        the lines and give the same height, the surface is that of the best, see
+        `LineSurface.renumbered`.
 
     Raises
     ------
@@ -122,7 +124,7 @@ def fit_lines(data: LineData, numberings: list[FloatArray], rig: LineRig) -> Lin
         (_best_quadric(data, numbers, rig) for numbers in numberings),
         key=lambda one: one.cost,
     )
-    near, others = _near(tried)
+    near, others, all_near = _near(tried)
     refined, jerk = _all_refined(near, data, JERK), JERK
     if not refined[0].smooth:
         jerk = _jerk_of(refined[0].surface)
@@ -132,7 +134,7 @@ def fit_lines(data: LineData, numberings: list[FloatArray], rig: LineRig) -> Lin
     margin = min(others, default=np.inf)
     least = LEAST_MARGIN + NUMBERS_MARGIN * best.cost
     rivals = [one for one in refined[1:] if one.cost - best.cost < least]
-    determined = _is_determined(best, margin, rivals)
+    determined = _is_determined(best, margin, rivals) and (all_near or not rivals)
     if determined:
         best, *rivals = (_of_widths(one, data, jerk) for one in (best, *rivals))
         determined = _is_determined(best, margin, rivals)
@@ -141,10 +143,13 @@ def fit_lines(data: LineData, numberings: list[FloatArray], rig: LineRig) -> Lin
     return replace(best.surface, margin=margin, status="ok" if determined else "profile")
 
 
-def _near(tried: list[_Hypothesis]) -> tuple[list[_Hypothesis], list[float]]:
-    """Quadrics to refine, of both orders of the lines, and the additional costs of the others."""
+def _near(tried: list[_Hypothesis]) -> tuple[list[_Hypothesis], list[float], bool]:
+    """Quadrics to refine, of both orders of the lines, and additional costs of the others.
+
+    Also whether these are no more than those that cost too much.
+    """
     limit = NEAR_COST * tried[0].cost + NEAR_COST_MORE
-    near, others = list[_Hypothesis](), list[float]()
+    near, others, are_all = list[_Hypothesis](), list[float](), True
     left = {True: MOST_REFINED, False: MOST_REFINED}
     for one in tried:
         upwards = bool(one.numbers[-1] > one.numbers[0])
@@ -153,7 +158,8 @@ def _near(tried: list[_Hypothesis]) -> tuple[list[_Hypothesis], list[float]]:
             near.append(one)
         else:
             others.append(one.cost - tried[0].cost)
-    return near, others
+            are_all &= one.cost >= limit
+    return near, others, are_all
 
 
 def _all_refined(near: list[_Hypothesis], data: LineData, jerk: float) -> list[_Refined]:
