@@ -206,6 +206,7 @@ def test_numbers_that_give_another_height_leave_a_profile(monkeypatch: pytest.Mo
     four = first_lines(exact_data(rendered(egg(6.0, 2.8, 3.2, 0.3)), sigma_mm=0.02)[0], 4)
     either = [np.array([1.0, 2, 3, 4]), np.array([2.0, 3, 4, 5])]
     monkeypatch.setattr("labapp.core.lines.fit.ALIKE_HEIGHT", (0.0, 0.0))
+    monkeypatch.setattr("labapp.core.lines.fit.LEAST_MARGIN", 0.0)  # the height alone decides
     fitted = fit_lines(four, either, RIG)
     assert fitted.status == "profile"
     assert fitted.numbered

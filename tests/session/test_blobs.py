@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.images.dots import Dots
+from labapp.core.lines.surface import LineSurface
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import CloughTocherSurface, ThinPlateSurface
@@ -102,6 +103,28 @@ def test_spline_surface_is_restored():
     basis = SplineBasis.over(np.array([-3.0, -4.0]), np.array([3.0, 4.0]), 0.7)
     large_surface = SplineSurface(basis, rng.normal(size=np.prod(basis.shape)))
     assert same(unpack(pack(large_surface)), large_surface)
+
+
+@pytest.mark.parametrize(
+    ("size", "others"), [(0, (0, 0)), (0, (2, 0)), (-1, (0, 0)), (0, (1, -1)), (0, (1, 1))]
+)
+def test_surface_of_lines_has_a_covariance_of_its_coefficients(size: int, others: tuple[int, int]):
+    basis = SplineBasis.over(np.zeros(2), np.full(2, 3.0), 0.9)
+    surface = LineSurface(
+        SplineSurface(basis, np.zeros(basis.count)),
+        np.eye(basis.count + size),
+        np.arange(3),
+        np.zeros((4, 3)),
+        0.1,
+        10.0,
+        "ok",
+        renumbered=np.zeros((others[0], others[0] and basis.count + others[1])),
+    )
+    if size or others[1]:
+        with pytest.raises(Damaged):
+            unpack(pack(surface))
+    else:
+        assert same(unpack(pack(surface)), surface)
 
 
 def test_measurement_without_a_surface_is_restored(unmeasured: Measurement):

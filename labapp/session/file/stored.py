@@ -163,6 +163,12 @@ def _line_correction_fits(value: Any) -> bool:
     return len(value.number) == len(lines) and all(len(one.image_px) > 1 for one in lines)
 
 
+def _line_surface_fits(value: Any) -> bool:
+    count = value.surface.basis.count
+    others = value.renumbered
+    return len(value.covariance) == count and (not len(others) or others.shape[1] == count)
+
+
 def _all_within(numbers: Any, least: float, most: float) -> bool:
     return bool(((numbers >= least) & (numbers <= most)).all())
 
@@ -290,6 +296,7 @@ STORED = {
     "LineSurface": Stored(
         LineSurface,
         shapes={"covariance": "p p", "numbers": "k", "point_mm": "n 3", "renumbered": "q r"},
+        fits=_line_surface_fits,
     ),
     "SetupVerdict": Stored(SetupVerdict),
     "Suspect": Stored(ResidualSuspect),
