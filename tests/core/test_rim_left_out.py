@@ -46,7 +46,14 @@ def without_ends(labels: IntArray, rows: int) -> IntArray:
 
 @pytest.mark.parametrize(
     ("width", "peak", "fullness"),
-    [(6.0, 0.28, 0.8), (5.4, 0.2, 0.85), (5.4, 0.2, 0.93), (5.2, 0.28, 0.95)],
+    [
+        (6.0, 0.28, 0.8),
+        (5.4, 0.2, 0.85),
+        (5.4, 0.2, 0.93),
+        (5.2, 0.28, 0.95),
+        (5.0, 0.2, 0.9),
+        (5.0, 0.28, 0.75),
+    ],
 )
 def test_pool_with_steep_sides_is_not_measured_too_low(
     width: float, peak: float, fullness: float
