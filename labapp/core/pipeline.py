@@ -224,7 +224,7 @@ def measure(
             result = replace(result, dots=dots)
             on_step("dots")
             observed = Observation.of(dots, bench, frame_shape)
-            tracked = track(prior, observed, settings.fit, match_settings)
+            tracked = track(prior, observed, match_settings)
             match, previous = tracked.match, prior.carried_over()
             lattice = lattice_of_match(match, rig, len(dots))
         else:
@@ -240,7 +240,7 @@ def measure(
             return _by_scheme(result, match, rig, settings), None
         pool = tracked.pool if tracked else fit.fit_surface(match, rig, settings.fit, initial)
         on_step("surface")
-        reconstruction, measured = fit.bound_and_measure(match, pool, rig, settings.fit, previous)
+        reconstruction, measured = fit.bound_and_measure(match, pool, rig, previous)
     except CannotMeasure as why:
         return _refused(result, why), None
     on_step("measures")

@@ -174,7 +174,7 @@ def fitted_frames(pool, count, rate_hz, rng):
         remaining = {name: getattr(match, name)[present] for name in per_dot}
         match = replace(match, ray_states=ray_states, **remaining)
         fitted = fit.fit_surface(match, OPEN_RIG, FitSettings(), near)
-        reconstruction, sizes = fit.bound_and_measure(match, fitted, OPEN_RIG, FitSettings())
+        reconstruction, sizes = fit.bound_and_measure(match, fitted, OPEN_RIG)
         near = fitted.surface
         yield k, k / rate_hz, reconstruction.unbounded, reconstruction.boundary, vars(sizes)
 

@@ -170,7 +170,7 @@ def test_wetting_slope_of_a_cap_is_that_at_its_boundary() -> None:
     pool = spherical_cap(5.6, 0.25)
     match = exact_match(trace(pool, OPEN_RIG))
     surface = fit.fit_surface(match, OPEN_RIG, FitSettings())
-    found = fit.bound_and_measure(match, surface, OPEN_RIG, FitSettings())[1]
+    found = fit.bound_and_measure(match, surface, OPEN_RIG)[1]
     # A sphere's cap of height h over a circle of radius a ends at the angle 2 atan(h/a).
     expected = np.degrees(2 * np.arctan(0.25 / 2.8))
     assert abs(found.wetting_slope_deg - expected) < 0.5 * found.wetting_slope_sigma_deg
@@ -325,8 +325,8 @@ def test_setup_part_of_a_frame_is_the_kept_one_or_the_mean_with_its_own(
     pool = spherical_cap(5.6, 0.25)
     match = exact_match(trace(pool, OPEN_RIG))
     surface = fit.fit_surface(match, OPEN_RIG, FitSettings())
-    made, sizes = fit.bound_and_measure(match, surface, OPEN_RIG, FitSettings())
+    made, sizes = fit.bound_and_measure(match, surface, OPEN_RIG)
     part = fit.SetupPart(np.full(9, 3.0), sizes.sizes, used=used)
     previous = fit.FromPrevious(made.boundary, (part,))
-    again, _ = fit.bound_and_measure(match, surface, OPEN_RIG, FitSettings(), previous)
+    again, _ = fit.bound_and_measure(match, surface, OPEN_RIG, previous)
     np.testing.assert_allclose(again.size_sigma_setup, np.full(9, expected))

@@ -318,13 +318,11 @@ def test_rear_sinks_although_no_dark_ray_is_seen_there() -> None:
         ray_states[(ray_states < 0) & (np.arange(1, 20)[:, None] < match.ray[:, 0].min() + 2)] = 0
         match = replace(match, ray_states=ray_states)
         fitted = fit.fit_surface(match, OPEN_RIG, FitSettings())
-        made, found = fit.bound_and_measure(match, fitted, OPEN_RIG, FitSettings())
+        made, found = fit.bound_and_measure(match, fitted, OPEN_RIG)
         assert (fitted.level.rear.drop_mm > 0.03) == (drop_mm > 0)
         assert abs(found.length_mm - pool.size.length_mm) < 2.5 * found.length_sigma_mm
         given = replace(fitted.level, drop_sigma_mm=0.0, drop_covariance_mm2=0.0)
-        certain, _ = fit.bound_and_measure(
-            match, replace(fitted, level=given), OPEN_RIG, FitSettings()
-        )
+        certain, _ = fit.bound_and_measure(match, replace(fitted, level=given), OPEN_RIG)
         less = certain.size_sigma_level < made.size_sigma_level
         assert less[WITH_SIGMA.index("length_mm")]
         assert not less[WITH_SIGMA.index("height_mm")]
@@ -359,7 +357,7 @@ def test_lengths_of_pools_with_a_low_rear_are_within_twice_their_uncertainty(tra
             pool, rig = replace(pool, footprint=back, terms=(low,)), replace(rig, travel="-y")
         match = exact_match(trace(pool, rig))
         fitted = fit.fit_surface(match, rig, FitSettings())
-        size = fit.bound_and_measure(match, fitted, rig, FitSettings())[1]
+        size = fit.bound_and_measure(match, fitted, rig)[1]
         deviations.append((size.length_mm - pool.size.length_mm) / size.length_sigma_mm)
     assert np.sqrt(np.mean(np.square(deviations))) < 2.2
 

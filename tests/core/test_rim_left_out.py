@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,18 +10,23 @@ import pytest
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.matching.checks.rim_left_out import refuse_rim_left_out
+from labapp.core.matching import repair
+from labapp.core.matching.checks.rim_left_out import is_rim_left_out
 from labapp.core.matching.free_setup import FreeHypothesis
 from labapp.core.matching.hypothesis import evaluate
 from labapp.core.matching.match_rays import match_of_hypothesis, open_candidates
 from labapp.core.matching.observation import UNLABELLED, Observation, neighbours_of
-from labapp.core.pipeline import Settings
+from labapp.core.matching.row_ends import continued_labels
+from labapp.core.pipeline import Measurement, Settings
 from labapp.core.recording.chain import WarmChain
-from labapp.core.values import CannotMeasure, FloatArray, IntArray
+from labapp.core.schemes import fit
+from labapp.core.schemes.fit import FitSettings
+from labapp.core.surface.measures import measure_surface
+from labapp.core.values import FloatArray, IntArray
 from labapp.simulation.forward import trace
 from labapp.simulation.pools import Footprint, Place, Pool, egg
 from labapp.simulation.render import Look, render
-from tests.benchmarks.dips import measure_pool
+from tests.benchmarks.dips import matched, measure_pool
 from tests.benchmarks.rendered import draw_view
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, see, true_labels
 
@@ -63,6 +69,39 @@ def test_pool_with_steep_sides_is_not_measured_too_low(
     assert result.status != "ok" or abs(result.height) < 0.05
 
 
+@pytest.mark.parametrize(
+    ("width", "peak", "fullness"),
+    [(5.0, 0.2, 0.8), (5.4, 0.2, 0.85), (5.8, 0.2, 0.8), (6.2, 0.28, 0.85), (6.6, 0.2, 0.9)],
+)
+def test_dots_of_steep_sides_get_their_rays(width: float, peak: float, fullness: float) -> None:
+    pool = Pool(Footprint(width, 0.55 * width, 0.6 * width), peak, fullness=fullness)
+    seen = see(pool, np.random.default_rng(int(width * 10)), sigma_px=0.08)
+    match = matched(seen)
+    assert (seen.ray[match.dot] == match.ray).all()
+    assert len(match.dot) == (true_labels(seen) != UNLABELLED).sum()
+    size = measure_surface(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
+    assert abs(size.height_mm - peak) < 2.5 * size.height_sigma_mm
+
+
+def test_false_dots_beyond_a_row_get_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(repair, "RIM_POSSIBLE", -np.inf)  # their cost decides, whatever their place
+    observed, labels = frame(false=40)
+    best = evaluate(observed, labels)
+    assert best is not None
+    assert (continued_labels(observed, labels) != labels).any()
+    assert (repair.with_rim(observed, best).labels == labels).all()
+
+
+def test_rows_are_continued_over_several_dots() -> None:
+    pool = Pool(Footprint(5.8, 3.2, 3.5), 0.2, fullness=0.85)
+    seen = see(pool, np.random.default_rng(1), sigma_px=0.05)
+    observed, labels = Observation.of(seen.dots, BENCH, FRAME_SHAPE), true_labels(seen)
+    middle = labels.shape[0] // 2
+    fewer = labels.copy()
+    fewer[middle, np.flatnonzero(labels[middle] != UNLABELLED)[-2:]] = UNLABELLED
+    assert (continued_labels(observed, fewer) == labels).all()
+
+
 @dataclass(frozen=True)
 class Toe:
     """Makes the height of a paraboloid, peak · (1 − ρ²), that of a pool that becomes flat at its
@@ -88,11 +127,22 @@ def test_pool_with_a_toe_is_not_measured_too_low(width: float, peak: float, powe
     assert result.status != "ok" or abs(result.height) < 0.05
 
 
-def test_dots_left_out_all_round_are_refused() -> None:
+@pytest.mark.parametrize(("width", "peak", "power"), [(5.6, 0.26, 1.2), (6.2, 0.2, 1.3)])
+def test_surface_follows_a_toe(width: float, peak: float, power: float) -> None:
+    pool = Pool(Footprint(width, 0.52 * width, 0.6 * width), peak, (Toe(peak, power),), fullness=0)
+    seen = see(pool, np.random.default_rng(1), sigma_px=0.05)
+    observed = Observation.of(seen.dots, BENCH, FRAME_SHAPE)
+    hypothesis = evaluate(observed, true_labels(seen))
+    assert hypothesis is not None
+    match = match_of_hypothesis(observed, hypothesis, hypothesis.orientation(observed))
+    size = measure_surface(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
+    assert abs(size.height_mm / pool.size.height_mm - 1) < 0.04
+    assert abs(size.width_mm - pool.size.width_mm) < 3 * size.width_sigma_mm
+
+
+def test_dots_left_out_all_round_are_noticed() -> None:
     observed, labels = frame()
-    with pytest.raises(CannotMeasure) as refusal:
-        refuse_rim_left_out(observed, without_ends(labels, rows=4))
-    assert refusal.value.status == "no-match"
+    assert is_rim_left_out(observed, without_ends(labels, rows=4))
 
 
 @pytest.mark.parametrize(("rows", "is_measured"), [(0, True), (4, False)])
@@ -110,36 +160,48 @@ def test_no_other_frame_decides_for_open_rows_without_the_rim(rows: int, is_meas
 @pytest.mark.parametrize("rows", [1, 2])
 def test_few_dots_left_out_are_accepted(rows: int) -> None:
     observed, labels = frame()
-    refuse_rim_left_out(observed, without_ends(labels, rows))
+    assert not is_rim_left_out(observed, without_ends(labels, rows))
 
 
-def test_followed_pool_is_not_measured_when_its_rim_becomes_steep() -> None:
+def followed(*fullness: float) -> Iterator[tuple[Measurement, bool]]:
+    """Measure frames of pools of a recording; yield the result and whether it was followed."""
     rng = np.random.default_rng(1)
     view = draw_view(rng)
     axes = (view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm)
     chain = WarmChain(Bench(BENCH_RIG, ImageCalibration.from_three_points(*axes)), Settings())
-    statuses = []
-    for fullness in (0.7, 0.75, 0.85):
-        pool = Pool(Footprint(5.8, 3.2, 3.5), 0.2, fullness=fullness)
-        statuses.append(
-            chain.measure(render(trace(pool, BENCH_RIG), view, Look(), rng).image).status
-        )
+    for each in fullness:
+        pool = Pool(Footprint(5.8, 3.2, 3.5), 0.2, fullness=each)
+        result = chain.measure(render(trace(pool, BENCH_RIG), view, Look(), rng).image)
+        yield result, chain.track_lost is None
+
+
+def test_followed_pool_is_not_measured_when_its_rim_becomes_steep() -> None:
+    statuses = [result.status for result, _ in followed(0.7, 0.75, 0.85)]
     assert statuses == ["ok", "ok", "no-match"]
+
+
+def test_steep_pool_is_followed_as_it_was_fitted() -> None:
+    (first, _), (second, is_followed) = followed(0.75, 0.75)
+    assert is_followed
+    assert first.measures is not None
+    assert second.measures is not None
+    assert second.measures.height_sigma_mm > 0.5 * first.measures.height_sigma_mm
+    assert abs(second.measures.height_mm - 0.2) < 3 * second.measures.height_sigma_mm
 
 
 def test_false_dots_anywhere_are_accepted() -> None:
     observed, labels = frame(false=12)
-    refuse_rim_left_out(observed, labels)
+    assert not is_rim_left_out(observed, labels)
 
 
 def test_dots_left_out_within_the_others_are_accepted() -> None:
     observed, labels = frame()
     inner = np.argwhere(neighbours_of(labels != UNLABELLED) == 8)[:8]
     labels[tuple(inner.T)] = UNLABELLED
-    refuse_rim_left_out(observed, labels)
+    assert not is_rim_left_out(observed, labels)
 
 
 def test_dots_that_fill_the_frame_are_accepted() -> None:
     observed, labels = frame()
     cut = replace(observed, frame_shape=(1, 1))
-    refuse_rim_left_out(cut, without_ends(labels, rows=4))
+    assert not is_rim_left_out(cut, without_ends(labels, rows=4))

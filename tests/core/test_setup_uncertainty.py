@@ -40,7 +40,7 @@ def changes(pool: FittedPool | None = None, match: Match = MATCH) -> FloatArray:
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
     boundary, slope = trace_boundary(basis, coefficients, pool.level, center)
     gradient = sizes_and_gradients(basis, coefficients, pool.level, boundary, slope).gradient
-    return setup_changes(match, RIG, SETTINGS, pool, gradient)
+    return setup_changes(match, RIG, pool, gradient)
 
 
 def sizes_on(offset: FloatArray, seen: Match = MATCH) -> FloatArray:
@@ -105,7 +105,7 @@ def test_changes_do_not_depend_on_a_reused_factor() -> None:
 def test_exact_bench_has_no_changes() -> None:
     rig, pool = replace(RIG, uncertainty=None), fit.fit_surface(MATCH, RIG, SETTINGS)
     gradient = np.ones((6, len(pool.surface.coefficients)))
-    assert setup_changes(MATCH, rig, SETTINGS, pool, gradient).shape == (6, 0)
+    assert setup_changes(MATCH, rig, pool, gradient).shape == (6, 0)
 
 
 @pytest.mark.parametrize("key", ["laser.azimuth_deg", "pattern.rotation_deg", "imaging_plane.s_mm"])
@@ -115,7 +115,7 @@ def test_fit_changes_agree_with_fits_on_perturbed_benches(key: str) -> None:
     offset = 0.1 * RIG.uncertainty.root[:, INDEX[key]]
     dots = MATCH.plane_mm, MATCH.plane_covariance_mm2
     pool = fit.fit_surface(MATCH, RIG, SETTINGS)
-    residuals, coefficients = fit_changes(MATCH, RIG, SETTINGS, pool)
+    residuals, coefficients = fit_changes(MATCH, RIG, pool)
     more, less = (
         fit.fit_surface(
             replace(MATCH, plane_mm=moved_dots(dots[0], RIG, RIG.uncertainty.axes, vector)),

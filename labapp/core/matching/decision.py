@@ -8,7 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from labapp.core.matching.checks.hidden_rows import lines_before, rays_beside_hidden_rows
-from labapp.core.matching.checks.rim_left_out import refuse_rim_left_out
+from labapp.core.matching.checks.rim_left_out import (
+    is_rim_left_out,
+    refuse_rim_left_out,
+)
 from labapp.core.matching.checks.unexplained import (
     MOST_SCATTERED,
     any_explains,
@@ -40,6 +43,7 @@ from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
+from labapp.core.matching.repair import with_rim
 from labapp.core.surface.level import KnownRays
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
@@ -130,7 +134,8 @@ def decide(
             rivals.append((other.labels, _excess(other, cheapest)))
     best = supported(observed, _without(observed, best, doubtful, fit_settings), fit_settings)
     best = _with_unknown(observed, best, ended.labels, fit_settings)
-    with_rim = best.labels  # dots beyond a hidden row lose their rays, but were not left out
+    best = with_rim(observed, best)
+    all_labels = best.labels  # dots beyond a hidden row lose their rays, but were not left out
     refuse_much_in_doubt(best)
     _refuse_hidden_marker(observed, best)
     best = _without_rays(
@@ -144,8 +149,8 @@ def decide(
         best = _without(observed, best, unconfirmed(freed[0], best.labels), fit_settings)
     open_holes = freed if len(freed) > 1 else []
     open_holes = with_rivals(observed, open_holes, best.labels, rivals)
-    if not open_holes:
-        refuse_rim_left_out(observed, with_rim)
+    if not open_holes and is_rim_left_out(observed, all_labels):
+        refuse_rim_left_out()
     return best, open_holes
 
 

@@ -341,11 +341,11 @@ def _step(
     matched = MatchedDots(
         at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot], hypothesis.ray_states
     )
-    residuals, coefficients = fit_changes(matched, observed.rig, USUAL_FIT, pool)
+    residuals, coefficients = fit_changes(matched, observed.rig, pool)
     change = residuals.reshape(len(sigma), -1)
     finite = np.isfinite(change).all(axis=1)  # a ray at the rim may leave the splines
     jacobian = change[finite] / sigma[finite, None]
-    rough = roughness_weight(pool, USUAL_FIT) * pool.surface.basis.roughness_products(coefficients)
+    rough = roughness_weight(pool) * pool.surface.basis.roughness_products(coefficients)
     normal = jacobian.T @ jacobian + np.eye(len(deviation)) + coefficients.T @ rough
     rhs = jacobian.T @ (pool.residual_mm.ravel() / sigma)[finite] + deviation
     rhs += rough.T @ pool.surface.coefficients

@@ -35,7 +35,12 @@ from labapp.core.matching.prediction import (
 from labapp.core.matching.ray_classes import RayClasses, classify_rays
 from labapp.core.rows.lattice import Lattice, Site
 from labapp.core.surface.level import Level
-from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings, FittedPool
+from labapp.core.surface.pool_fit import (
+    CORRELATED_MM2,
+    ROUGHNESS_FREEDOM,
+    FitSettings,
+    FittedPool,
+)
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
 KNOT_ERROR_MM = 0.045
@@ -59,9 +64,6 @@ always place a dot there."""
 SETUP_ERROR_MM, MOST_BOUNDARY_COST = 0.01, 60.0
 """Error of the height at the boundary due to the set-up, mm; and the largest cost of the rays near
 the boundary, in units of χ²."""
-
-ROUGHNESS_FREEDOM = 100.0
-"""Degrees of freedom with which the expected size of a surface's third derivatives is known."""
 
 Marker = Literal["empty", "lit", "unknown"]
 """State of the place of the marker's absent dot: ``lit``, there is a dot; ``empty``, there is
@@ -251,7 +253,7 @@ def _evaluated(
         stray_dots=classes.stray,
         marker=marker,
         misfit_without_marker=cost + _boundary_cost(pool.level),
-        roughness=_roughness_cost(pool, fit_settings),
+        roughness=_roughness_cost(pool),
     )
 
 
@@ -318,22 +320,17 @@ def _boundary_cost(level: Level) -> float:
     return min(2 * share * level.negative_log_likelihood, MOST_BOUNDARY_COST)
 
 
-def _roughness_cost(pool: FittedPool, fit_settings: FitSettings) -> float:
+def _roughness_cost(pool: FittedPool) -> float:
     """−2 log probability of a surface's third derivatives, whose expected size is uncertain.
 
     Wrong labels nearly always need a rougher surface than correct ones.
     """
-    return ROUGHNESS_FREEDOM * float(np.log1p(_roughness_ratio(pool, fit_settings)))
+    return ROUGHNESS_FREEDOM * float(np.log1p(pool.roughness_ratio))
 
 
-def roughness_weight(pool: FittedPool, fit_settings: FitSettings) -> float:
+def roughness_weight(pool: FittedPool) -> float:
     """Derivative of the cost of a surface's roughness by the roughness, mm²."""
-    return CORRELATED_MM2 / fit_settings.jerk**2 / (1 + _roughness_ratio(pool, fit_settings))
-
-
-def _roughness_ratio(pool: FittedPool, fit_settings: FitSettings) -> float:
-    """A surface's roughness in units of the expected one, per `ROUGHNESS_FREEDOM`."""
-    return CORRELATED_MM2 / fit_settings.jerk**2 * pool.surface.roughness() / ROUGHNESS_FREEDOM
+    return CORRELATED_MM2 / pool.settings.jerk**2 / (1 + pool.roughness_ratio)
 
 
 def _marker_state(observed: Observation, lit: BoolArray, pool: FittedPool) -> Marker | None:

@@ -1,4 +1,4 @@
-"""Repair of labels that leave dots or rays unexplained: swapped, skipped or omitted rows."""
+"""Repair of labels that leave dots or rays unexplained: rows, and the rim of a steep pool."""
 
 from __future__ import annotations
 
@@ -7,11 +7,17 @@ from collections.abc import Iterator
 import numpy as np
 import scipy
 
+from labapp.core.matching.checks.rim_left_out import (
+    RIM_POSSIBLE,
+    refuse_rim_left_out,
+    rim_evidence,
+)
 from labapp.core.matching.checks.unexplained import explains, suffices
 from labapp.core.matching.hypothesis import (
     FINE_FIT,
     KNOT_ERROR_MM,
     Hypothesis,
+    evaluate_averaged,
     grow_and_evaluate,
 )
 from labapp.core.matching.observation import UNLABELLED, Observation, widened, within_rings
@@ -21,6 +27,7 @@ from labapp.core.matching.prediction import (
     pair_deviances,
     predict,
 )
+from labapp.core.matching.row_ends import continued_labels
 from labapp.core.values import BoolArray, IntArray
 
 DISCARDED_RINGS = 2
@@ -192,3 +199,28 @@ def _rows_begun(observed: Observation, hypothesis: Hypothesis) -> list[Hypothesi
         if wider is not None:
             found.append(wider)
     return found
+
+
+def with_rim(observed: Observation, best: Hypothesis) -> Hypothesis:
+    """Label the dots of a steep rim, if this costs less than that they are false.
+
+    The surface through the others is too smooth to predict them. Fine knots follow a steep rim.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-match`` if it costs more, but only because the surface is rough.
+    """
+    evidence = rim_evidence(observed, best.labels)
+    if evidence <= RIM_POSSIBLE:
+        return best
+    own = evaluate_averaged(observed, best.labels, FINE_FIT, best.pool)
+    labels = continued_labels(observed, best.labels)
+    wider = evaluate_averaged(observed, labels, FINE_FIT, best.pool)
+    if own is None or wider is None:
+        return best
+    if wider.cost <= own.cost + 2 * evidence:
+        return wider
+    if wider.misfit < own.misfit:
+        refuse_rim_left_out()
+    return best

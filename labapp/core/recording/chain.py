@@ -94,7 +94,7 @@ class WarmChain:
         measurement, prior = measure(image, self.bench, self.settings)
         former = self._prior
         if prior is not None and former is not None:
-            prior = prior.with_past_of(former, self.bench, self.settings.fit)
+            prior = prior.with_past_of(former, self.bench)
         elif measurement.status != "ok" and former is not None and former.unseen < HELD:
             self.skip()
             return measurement

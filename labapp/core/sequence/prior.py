@@ -69,6 +69,8 @@ class Prior:
     cold_match, cold_residual_mm
         Match of the last frame that was measured without a prior, and its root mean square
         residual, mm.
+    basis, settings
+        Splines of the surface, and the settings with which it was fitted.
     paths, lit, boundary, level
         Paths of the R rays of the pattern for the last surface; which of them had dots, shape
         (rows, columns); boundary and level of the pool.
@@ -86,6 +88,7 @@ class Prior:
     cold_match: Match
     cold_residual_mm: float
     basis: SplineBasis
+    settings: FitSettings
     paths: RayPaths
     lit: BoolArray
     boundary: Boundary
@@ -114,6 +117,7 @@ class Prior:
             cold_match=match,
             cold_residual_mm=pool.residual_rms_mm,
             basis=basis,
+            settings=pool.settings,
             paths=paths,
             lit=match.ray_states > 0,
             boundary=reconstruction.boundary,
@@ -154,12 +158,14 @@ class Prior:
         past, slopes = self.past[-1:], self.slopes[-1:]
         return replace(self, unseen=self.unseen + 1, past=past, slopes=slopes)
 
-    def with_past_of(self, former: Prior, bench: Bench, settings: FitSettings) -> Prior:
+    def with_past_of(self, former: Prior, bench: Bench) -> Prior:
         """Convert the prior to the splines of a former one and adopt its past, if possible."""
+        if self.settings != former.settings:
+            return self
         x, y = bench.rays.landing_mm[..., 0], bench.rays.landing_mm[..., 1]
         if (self.basis.contains(x, y) != former.basis.contains(x, y)).any():
             return self
-        paths = self._in_splines(former, bench, settings)
+        paths = self._in_splines(former, bench)
         if paths is None:
             return self
         return replace(
@@ -170,14 +176,14 @@ class Prior:
             slopes=np.concatenate([former.slopes[1 - MEMORY :], paths.slopes[None]]),
         )
 
-    def _in_splines(self, former: Prior, bench: Bench, settings: FitSettings) -> RayPaths | None:
+    def _in_splines(self, former: Prior, bench: Bench) -> RayPaths | None:
         """Refit the surface in the splines of a former prior; None if it does not converge."""
         match, basis = self.cold_match, former.basis
         at = tuple(match.ray.T - 1)
         ray = np.ravel_multi_index(at, self.lit.shape)
         points = self.paths.points_mm[ray]
         equations = normal_equations(
-            basis, bench.rig, points, match.plane_mm, match.plane_covariance_mm2, settings
+            basis, bench.rig, points, match.plane_mm, match.plane_covariance_mm2, self.settings
         )
         fit = Rounds(equations, bench.rays.directions[at], former.past[-1], points)
         try:

@@ -18,7 +18,7 @@ import numpy as np
 
 from labapp.core.images import band_pass_kernels
 from labapp.core.match import Trial, missing_share
-from labapp.core.matching.checks.rim_left_out import refuse_rim_left_out
+from labapp.core.matching.checks.rim_left_out import RIM_POSSIBLE, rim_evidence
 from labapp.core.matching.checks.unexplained import is_scattered, refuse_contradicted
 from labapp.core.matching.checks.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.label_growth import OUTLIER_SPACINGS, OUTLIER_TIMES
@@ -28,7 +28,7 @@ from labapp.core.matching.observation import UNLABELLED, Observation, amid, coun
 from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_states, classify_rays
 from labapp.core.schemes import LEAST_DOTS
-from labapp.core.schemes.fit import UNSETTLED_MM
+from labapp.core.schemes.fit import UNSETTLED_MM, is_too_smooth
 from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Prior, Tracked, predictions
 from labapp.core.surface.level import (
     BOUNDARY_UNSEEN,
@@ -38,6 +38,7 @@ from labapp.core.surface.level import (
     boundary_is_seen,
 )
 from labapp.core.surface.pool_fit import (
+    REUSE_FLOORS,
     FitSettings,
     fitted_pool,
     normal_equations,
@@ -64,7 +65,8 @@ RIVALS = 3
 ray: the next ones are farther away by a row or a column."""
 
 WORSE = 2.0
-"""Maximum ratio of the residual to that of the frame that was matched without a prior."""
+"""Maximum ratio of the residual to that of the frame that was matched without a prior, or to the
+least σ of the dots if that is larger."""
 
 HELD = 8
 """Maximum number of frames through which the datum is carried while not all neighbours of the
@@ -92,9 +94,7 @@ class TrackLost(CannotMeasure):
         super().__init__("track-lost", reason)
 
 
-def track(
-    prior: Prior, observed: Observation, settings: FitSettings, limits: MatchSettings
-) -> Tracked:
+def track(prior: Prior, observed: Observation, limits: MatchSettings) -> Tracked:
     """Find the ray of every dot, and the surface, by prediction from the previous frames.
 
     Raises
@@ -104,8 +104,8 @@ def track(
     CannotMeasure
         If there is no surface.
     """
-    paths, labels, off = _found_again(prior, observed, settings)
-    fit = _Fit.of(prior, observed, settings, labels, paths)
+    paths, labels, off = _found_again(prior, observed)
+    fit = _Fit.of(prior, observed, labels, paths)
     fit.run(ROUGHLY_MM)
     for _ in range(WIDENINGS):
         before, labels = labels, _extended_labels(fit)
@@ -127,11 +127,13 @@ def track(
         raise TrackLost("too many dots do not fit one surface")
     dots = fit.labels.ravel()[fit.lit_rays]
     _check_explained(observed, fit.labels, classes, limits)
-    pool = fitted_pool(fit.rounds, level, observed.rig, observed.plane_mm[dots])
-    if not pool.residual_rms_mm < WORSE * prior.cold_residual_mm:
+    pool = fitted_pool(fit.rounds, level, observed.rig, observed.plane_mm[dots], prior.settings)
+    usual_mm = max(prior.cold_residual_mm, prior.settings.floor_mm)
+    if not pool.residual_rms_mm < WORSE * usual_mm:
         raise TrackLost("the surface no longer explains the dots")
     refuse_contradicted(known_rays, pool)
-    refuse_rim_left_out(observed, fit.labels)
+    if rim_evidence(observed, fit.labels) > RIM_POSSIBLE:
+        raise TrackLost("dots without a ray may be those of the rim")
     paths = fit.paths()
     is_seen = _reference_is_seen(observed, paths, off)
     if not is_seen and prior.unseen >= HELD:
@@ -142,6 +144,8 @@ def track(
     lit, missed = fit.labels != UNLABELLED, len(classes.missed)
     at = np.argwhere(lit)
     match = match_of_pairs(observed, at, dots, orientation, classes.ray_states, missed, trials)
+    if is_too_smooth(pool, match, prior.settings):
+        raise TrackLost("the surface bends more than before")
     return Tracked(match, pool, paths, lit, is_seen)
 
 
@@ -151,8 +155,8 @@ class _Fit:
 
     Parameters
     ----------
-    prior, observed, settings
-        The prior, the frame's dots, and the settings of the fit.
+    prior, observed
+        The prior, and the frame's dots.
     labels
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
     lit_rays
@@ -163,7 +167,6 @@ class _Fit:
 
     prior: Prior
     observed: Observation
-    settings: FitSettings
     labels: IntArray
     lit_rays: IntArray
     near: RayPaths
@@ -175,7 +178,6 @@ class _Fit:
         cls,
         prior: Prior,
         observed: Observation,
-        settings: FitSettings,
         labels: IntArray,
         near: RayPaths,
     ) -> _Fit:
@@ -190,15 +192,18 @@ class _Fit:
             points_mm=landing,
             plane_mm=observed.plane_mm[dots],
             plane_covariance_mm2=observed.covariance_mm2[dots],
-            settings=settings,
+            settings=prior.settings,
         )
+        if prior.settings.jerk > FitSettings.jerk:
+            # A surface that may bend more is determined less: with an old factor it would diverge.
+            equations.reuse_mm = REUSE_FLOORS * prior.settings.floor_mm
         directions = observed.rays.directions.reshape(-1, 3)[rays]
         rounds = Rounds(equations, directions, near.coefficients, near.points_mm[rays])
-        return cls(prior, observed, settings, labels, rays, near, rounds)
+        return cls(prior, observed, labels, rays, near, rounds)
 
     def with_labels(self, labels: IntArray) -> _Fit:
         """Start a fit to other labels from the current surface."""
-        return _Fit.of(self.prior, self.observed, self.settings, labels, self.paths())
+        return _Fit.of(self.prior, self.observed, labels, self.paths())
 
     def without_dots(self, dots: IntArray) -> _Fit:
         """Start a fit without some dots from the current surface."""
@@ -251,9 +256,7 @@ class _Fit:
 # --- from the prediction to labels --------------------------------------------------------------
 
 
-def _found_again(
-    prior: Prior, observed: Observation, settings: FitSettings
-) -> tuple[RayPaths, IntArray, float]:
+def _found_again(prior: Prior, observed: Observation) -> tuple[RayPaths, IntArray, float]:
     """Find the dots again; return ray paths, labels, and the distance of dots from predictions.
 
     The distance is the median over the dots, in spacings of the predicted dots. If no prediction
@@ -271,16 +274,14 @@ def _found_again(
     found = 0
     for coefficients in prior.past[: -GROWN_FROM - 1 : -1]:
         paths = RayPaths.of(observed.bench, prior.basis, coefficients, last, 2)
-        paths, labels = _grown(prior, observed, settings, paths)
+        paths, labels = _grown(prior, observed, paths)
         found = max(found, count_labels(labels))
         if found >= max(FOUND * count, LEAST_DOTS):
             return paths, labels, np.inf
     raise TrackLost(f"{found} of {count} dots were found again")
 
 
-def _grown(
-    prior: Prior, observed: Observation, settings: FitSettings, paths: RayPaths
-) -> tuple[RayPaths, IntArray]:
+def _grown(prior: Prior, observed: Observation, paths: RayPaths) -> tuple[RayPaths, IntArray]:
     """Find the dots again from the absent one outwards, ring by ring.
 
     Dots in the middle move least from frame to frame, and their motion predicts that of the others.
@@ -297,7 +298,7 @@ def _grown(
         )
         if count_labels(labels) < LEAST_DOTS:
             break
-        fit = _Fit.of(prior, observed, settings, labels, paths)
+        fit = _Fit.of(prior, observed, labels, paths)
         fit.rounds.run(GROWING_ROUNDS, SETTLED_MM, smooth_about=start)
         paths = fit.paths()
     return paths, labels
@@ -389,7 +390,7 @@ def _unsupported(fit: _Fit, covariance: FloatArray, classes: RayClasses, level: 
         paths=fit.paths(),
         covariance_mm2=covariance,
         classes=classes,
-        floor_mm=fit.settings.floor_mm,
+        floor_mm=fit.prior.settings.floor_mm,
         unsettled_mm=fit.rounds.moved_mm,
         was_lit=fit.prior.lit,
     )
@@ -415,7 +416,7 @@ def _with_level(
     known_rays = replace(known_rays, height_sigma_mm=sigma)
     near = replace(prior.level, shift_mm=0.0)
     search = LevelSearch(known_rays, near, prior.drop_is_free, RAISED_MM)
-    level = fit.rounds.run(fit.settings.rounds, SETTLED_MM, search=search)
+    level = fit.rounds.run(fit.prior.settings.rounds, SETTLED_MM, search=search)
     fit.check_settled()
     return RayClasses(ray_states, found.missed, found.stray), known_rays, level
 

@@ -54,6 +54,9 @@ which the largest harmless value depends."""
 CORRELATED_MM2 = 1.0
 """Area over which a pool's third derivatives are correlated, mm²."""
 
+ROUGHNESS_FREEDOM = 100.0
+"""Degrees of freedom with which the expected size of a surface's third derivatives is known."""
+
 
 @dataclass(frozen=True)
 class FitSettings:
@@ -66,7 +69,8 @@ class FitSettings:
     knot_mm
         Spacing of the spline knots, mm.
     jerk
-        Expected third derivatives of the surface, mm⁻²: the smaller, the smoother.
+        Expected third derivatives of the surface, mm⁻²: the smaller, the smoother. Scheme fit
+        takes larger ones for a surface that is rougher than expected.
     floor_mm
         Added in quadrature to the standard uncertainty of every dot on the imaging plane, mm.
     settled_mm
@@ -98,6 +102,8 @@ class FittedPool(ReadOnlyArrays):
         Computed minus captured dot on the imaging plane (X′, Z′), shape (n, 2), mm.
     unsettled_mm
         Largest displacement of a reflection point in the last round, mm.
+    settings
+        Settings of the fit.
     inverse
         Covariance of the coefficients within the band (`solver.inverse_of`), if computed.
     """
@@ -108,12 +114,18 @@ class FittedPool(ReadOnlyArrays):
     points_mm: FloatArray
     residual_mm: FloatArray
     unsettled_mm: float
+    settings: FitSettings
     inverse: FloatArray | None = None
 
     @cached_property
     def residual_rms_mm(self) -> float:
         """Root mean square distance of computed from captured dots, mm."""
         return float(np.sqrt(np.sum(self.residual_mm**2) / len(self.residual_mm)))
+
+    @cached_property
+    def roughness_ratio(self) -> float:
+        """Integral of the squared third derivatives over the expected one (`ROUGHNESS_FREEDOM`)."""
+        return _roughness_weight(self.settings) * self.surface.roughness() / ROUGHNESS_FREEDOM
 
     @cached_property
     def mean_splines(self) -> FloatArray:
@@ -177,7 +189,7 @@ def fit_pool(
     if np.isnan(moved):
         raise CannotMeasure("no-surface", NO_SURFACE)
     surface, level = SplineSurface(basis, coefficients), Level.of(found)
-    pool = FittedPool(surface, factor, level, points, residual, moved)
+    pool = FittedPool(surface, factor, level, points, residual, moved, settings)
     return _weighed(pool, match, rig, settings) if weigh_by_height_sigma else _on_plane(pool)
 
 
@@ -198,7 +210,7 @@ def _weighed(
     sigma = rounds.height_sigma_mm(known_rays.landing_mm)
     search = LevelSearch(replace(known_rays, height_sigma_mm=sigma), pool.level)
     level = rounds.run(settings.rounds, settings.settled_mm, search=search)
-    return fitted_pool(rounds, level, rig, match.plane_mm)
+    return fitted_pool(rounds, level, rig, match.plane_mm, settings)
 
 
 def misfits(
@@ -291,7 +303,9 @@ def normal_equations(
     return NormalEquations(basis, stiffness, laser, plane, dots, weights)
 
 
-def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) -> FittedPool:
+def fitted_pool(
+    rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray, settings: FitSettings
+) -> FittedPool:
     """Build the result of rounds with their level, for dots on the plane, shape (n, 2).
 
     Raises
@@ -314,6 +328,7 @@ def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) ->
             points_mm=points,
             residual_mm=computed - plane_mm,
             unsettled_mm=rounds.moved_mm,
+            settings=settings,
             inverse=rounds.equations.known_inverse,
         )
     )

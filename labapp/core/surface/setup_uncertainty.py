@@ -17,7 +17,7 @@ from labapp.core.geometry.optics import project_rays
 from labapp.core.geometry.perturbation import aimed_as, moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match, MatchedDots
-from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equations
+from labapp.core.surface.pool_fit import FittedPool, normal_equations
 from labapp.core.surface.solver import NormalEquations, height_sigma, normal_factor
 from labapp.core.values import FloatArray, IntArray
 
@@ -36,14 +36,12 @@ REACH = 0.4
 """Reach of the search for the level (`find_level`) around that of the unperturbed surface."""
 
 
-def setup_changes(
-    match: Match, rig: Rig, settings: FitSettings, pool: FittedPool, gradient: FloatArray
-) -> FloatArray:
+def setup_changes(match: Match, rig: Rig, pool: FittedPool, gradient: FloatArray) -> FloatArray:
     """Changes of sizes due to each independent error component of the bench.
 
     Parameters
     ----------
-    match, rig, settings
+    match, rig
         Input of the fit.
     pool
         Result of the fit, with p splines.
@@ -64,7 +62,7 @@ def setup_changes(
         return np.zeros((len(gradient), 0))
     changes = np.zeros((len(gradient), len(uncertainty.root)))
     columns, benches = _benches(rig, match.plane_mm)
-    equations = _factorised(match, rig, settings, pool)
+    equations = _factorised(match, rig, pool)
     change = _response(match.ray, equations, pool, benches) / SHARE
     basis, level, own = pool.surface.basis, pool.level, project_rays(rig.laser, rig.pattern)
     seen = (match.ray_states != 0) & basis.contains(own.landing_mm[..., 0], own.landing_mm[..., 1])
@@ -87,7 +85,7 @@ def setup_changes(
 
 
 def fit_changes(
-    match: Match | MatchedDots, rig: Rig, settings: FitSettings, pool: FittedPool
+    match: Match | MatchedDots, rig: Rig, pool: FittedPool
 ) -> tuple[FloatArray, FloatArray]:
     """Changes of a fit due to each independent error component of the bench.
 
@@ -105,7 +103,7 @@ def fit_changes(
     assert rig.uncertainty is not None
     at, surface = tuple(match.ray.T - 1), pool.surface
     columns, benches = _benches(rig, match.plane_mm)
-    equations = _factorised(match, rig, settings, pool)
+    equations = _factorised(match, rig, pool)
     responses = _response(match.ray, equations, pool, benches)
     changes = np.zeros((*match.plane_mm.shape, len(rig.uncertainty.root)))
     of_coefficients = np.zeros((len(surface.coefficients), len(rig.uncertainty.root)))
@@ -137,12 +135,12 @@ def _benches(rig: Rig, plane_mm: FloatArray) -> tuple[IntArray, list[tuple[Rig, 
     return columns, [perturbed(rig, root[:, k], plane_mm) for k in columns]
 
 
-def _factorised(
-    match: Match | MatchedDots, rig: Rig, settings: FitSettings, pool: FittedPool
-) -> NormalEquations:
+def _factorised(match: Match | MatchedDots, rig: Rig, pool: FittedPool) -> NormalEquations:
     """Normal equations with a factor for the final reflection points (see `SHARE`)."""
     basis, points = pool.surface.basis, pool.points_mm
-    own = normal_equations(basis, rig, points, match.plane_mm, match.plane_covariance_mm2, settings)
+    own = normal_equations(
+        basis, rig, points, match.plane_mm, match.plane_covariance_mm2, pool.settings
+    )
     own.factor = normal_factor(basis, own.stiffness, points, own.weights)
     return own
 
