@@ -31,11 +31,8 @@ class LivePenetration(QWidget):
         super().__init__()
         self._workspace, self._watch = workspace, watch
         self._model: tuple[str, PenetrationModel] | None = None
-        self.choose_button = button(
-            "Penetration model…",
-            "Choose a model that labapp penetration fit wrote; it predicts from the live pool",
-            self.choose,
-        )
+        tip = "Choose a model that labapp penetration fit wrote; it predicts from the live pool"
+        self.choose_button = button("Penetration model…", tip, self.choose)
         self.none_button = button("No model", "Stop predicting", lambda: self.set_model(None))
         self.words = Message(2)
         vbox(hbox(self.choose_button, self.none_button), self.words, of=self)

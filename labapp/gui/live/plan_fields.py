@@ -31,23 +31,14 @@ class PlanFields(QObject):
     def __init__(self, form: FieldForm) -> None:
         super().__init__(form)
         form.add(heading("Recording"))
+        tip = "How much from before the trigger is recorded, too: it is kept in memory"
         self.before = NumberField(
-            "Before the trigger",
-            "s",
-            lowest=0,
-            highest=600,
-            decimals=1,
-            tooltip="How much from before the trigger is recorded, too: it is kept in memory",
+            "Before the trigger", "s", lowest=0, highest=600, decimals=1, tooltip=tip
         )
         self.before.set_value(BEFORE_S)
+        tip = "How long after the trigger the recording ends; empty: when you end it"
         self.after = NumberField(
-            "After it",
-            "s",
-            lowest=0.1,
-            highest=86_400,
-            decimals=1,
-            optional=True,
-            tooltip="How long after the trigger the recording ends; empty: when you end it",
+            "After it", "s", lowest=0.1, highest=86_400, decimals=1, optional=True, tooltip=tip
         )
         tip = "1: every frame is recorded; 2: every second one…"
         self.every = whole("Every n-th frame", 1, tip, 10_000)

@@ -39,11 +39,8 @@ class RecordBar(QWidget):
         self.ring.setToolTip("How much from before the trigger is in memory")
         line = hbox((self.state, 1), plain_label("Before the trigger:"), self.ring)
         self.recording = Message(2)
-        self.record_button = button(
-            BEGIN,
-            "Record from some seconds before now on, or end the recording (Space, Ctrl+R)",
-            trigger,
-        )
+        tip = "Record from some seconds before now on, or end the recording (Space, Ctrl+R)"
+        self.record_button = button(BEGIN, tip, trigger)
         tip = "Note this moment beside the recording that runs (M)"
         self.mark_button = button("Mark", tip, mark)
         stop_button = button(

@@ -68,11 +68,8 @@ class LiveStreams(QWidget):
             for column, widget in enumerate((box, field.label, field)):
                 grid.addWidget(widget, 2 * row, column)
             grid.addWidget(self.words[kind], 2 * row + 1, 0, 1, 4)
-        self.anywhere = check_box(
-            "Other machines may connect",
-            "Otherwise only programs on this machine can",
-            lambda _: self._open_to_all(),
-        )
+        tip = "Otherwise only programs on this machine can"
+        self.anywhere = check_box("Other machines may connect", tip, lambda _: self._open_to_all())
         self.warning = selectable_label()
         words = "Send measures to control software"
         group = Group(words, grid, self.anywhere, self.warning)

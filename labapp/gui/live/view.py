@@ -455,11 +455,8 @@ class LiveView(QObject):
 
     def _make_group(self) -> None:
         self._choices = choices([])
-        self.camera = ChoiceField(
-            "Camera",
-            self._choices,
-            tooltip="Which camera to watch; the simulated one films a pool on this bench",
-        )
+        tip = "Which camera to watch; the simulated one films a pool on this bench"
+        self.camera = ChoiceField("Camera", self._choices, tooltip=tip)
         self.camera.edited.connect(lambda _: self._show_state())
         self.start_button = button("Start", "Show live what the camera sees", self.start)
         self.find_button = button("Find cameras", "List the cameras that are connected", self.find)

@@ -20,24 +20,14 @@ class MirrorForm(FieldForm):
         tip = "Which mirror the selected picture shows"
         self.kind = ChoiceField("Mirror", KINDS, tooltip=tip)
         self.kind.edited.connect(lambda kind: change(selected().of_kind(kind)))
+        tip = "Of the ball, or of the cap's rim: measure it with a micrometer"
         self.diameter = NumberField(
-            "Diameter",
-            "mm",
-            lowest=0.1,
-            highest=1000,
-            step=0.01,
-            decimals=3,
-            tooltip="Of the ball, or of the cap's rim: measure it with a micrometer",
+            "Diameter", "mm", lowest=0.1, highest=1000, step=0.01, decimals=3, tooltip=tip
         )
         self.diameter.edited.connect(lambda value: change(replace(selected(), diameter_mm=value)))
+        tip = "Of the plate's surface, or of the top of cap or ball, over the work piece"
         self.height_field = NumberField(
-            "Height",
-            "mm",
-            lowest=-100,
-            highest=1000,
-            step=0.01,
-            decimals=3,
-            tooltip="Of the plate's surface, or of the top of cap or ball, over the work piece",
+            "Height", "mm", lowest=-100, highest=1000, step=0.01, decimals=3, tooltip=tip
         )
         self.height_field.edited.connect(lambda value: change(replace(selected(), height_mm=value)))
         self.height_sigma = NumberField(

@@ -75,11 +75,8 @@ class FootSwitchPanel(Group):
         self.commands.setToolTip(
             "Type them in a terminal, then unplug the device and plug it in again"
         )
-        self.copy_button = button(
-            "Copy the commands",
-            "Copy the commands that give permission, for a terminal",
-            self._copy,
-        )
+        tip = "Copy the commands that give permission, for a terminal"
+        self.copy_button = button("Copy the commands", tip, self._copy)
         self.closed.edited.connect(lambda _: self._show_commands())
         then = selectable_label("Then unplug it and plug it in again.")
         self.rights = column_of(FieldForm(self.closed), self.commands, self.copy_button, then)

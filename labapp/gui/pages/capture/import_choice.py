@@ -62,14 +62,12 @@ class ImportChoice(Group):
         self.first = whole("First frame", 0, "The first frame to use, counted from 0")
         self.last = whole("Last frame", 0, "The last frame to use")
         self.every = whole("Every n-th", 1, "1: every frame; 2: every second one…")
+        tip = (
+            "The rate it was filmed at, where the recording does not say so, or says it "
+            "wrongly; empty: the recording's own"
+        )
         self.rate = NumberField(
-            "Frame rate",
-            "frames/s",
-            lowest=1e-6,
-            highest=MOST_HZ,
-            optional=True,
-            tooltip="The rate it was filmed at, where the recording does not say so, or says it "
-            "wrongly; empty: the recording's own",
+            "Frame rate", "frames/s", lowest=1e-6, highest=MOST_HZ, optional=True, tooltip=tip
         )
         fields = self.first, self.last, self.every, self.rate
         for field in fields:

@@ -23,11 +23,8 @@ class KeptRecordings(Group):
         self, look: Callable[[Path], object], begin_next: Callable[[Path], object]
     ) -> None:
         self.choice = ChoiceField("Beside the session", tooltip="Recordings not in the session")
-        see = button(
-            "Preview",
-            "Show its frames, and choose which of them to import",
-            lambda: look(Path(self.choice.value())),
-        )
+        tip = "Show its frames, and choose which of them to import"
+        see = button("Preview", tip, lambda: look(Path(self.choice.value())))
         begin = button(NEXT, NEXT_TIP, lambda: begin_next(Path(self.choice.value())))
         super().__init__("Other recordings", FieldForm(self.choice), see, begin)
         self.hide()

@@ -319,11 +319,8 @@ class ExportPage(Page):
         self.folder.edited.connect(lambda _: self._propose_folder())
         choose = button("Choose folder…", "Choose where to write", self.choose_folder)
         self.notes = wrapping_label()
-        self.again_button = button(
-            "Measure now",
-            "Measure the selected frames that are not measured or are out of date",
-            self.measure_again,
-        )
+        tip = "Measure the selected frames that are not measured or are out of date"
+        self.again_button = button("Measure now", tip, self.measure_again)
         keep_room(self.again_button)
         tip = "Write all that is ticked; a cancelled export leaves nothing behind"
         self.export_button = button("Export", tip, self.export)

@@ -139,33 +139,17 @@ class LaserPage(Page):
     def _make_panel(self) -> None:
         self.way = ChoiceField("Lengths", WAYS, tooltip="Where the lengths of the cross come from")
         self.way.edited.connect(self._show_way)
+        tip = "Full angle from one edge of the fan to the other, as the lens' maker gives it"
         self.fan = NumberField(
-            "Fan angle, full",
-            "°",
-            lowest=0.1,
-            highest=89.9,
-            step=0.5,
-            decimals=2,
-            tooltip="Full angle from one edge of the fan to the other, as the lens' maker gives it",
+            "Fan angle, full", "°", lowest=0.1, highest=89.9, step=0.5, decimals=2, tooltip=tip
         )
+        tip = "Standard uncertainty of the fan angle; 0.1° is assumed where its maker says nothing"
         self.fan_sigma = NumberField(
-            "Fan angle ±",
-            "°",
-            lowest=0,
-            highest=10,
-            step=0.05,
-            decimals=2,
-            tooltip="Standard uncertainty of the fan angle; 0.1° is assumed where its maker says "
-            "nothing",
+            "Fan angle ±", "°", lowest=0, highest=10, step=0.05, decimals=2, tooltip=tip
         )
+        tip = "Smallest step of the callipers or ruler: no length is known better than that"
         self.resolution = NumberField(
-            "Resolution",
-            "mm",
-            lowest=0,
-            highest=10,
-            step=0.01,
-            decimals=2,
-            tooltip="Smallest step of the callipers or ruler: no length is known better than that",
+            "Resolution", "mm", lowest=0, highest=10, step=0.01, decimals=2, tooltip=tip
         )
         for each in (self.fan, self.fan_sigma, self.resolution):
             each.edited.connect(lambda _: self._store())
@@ -188,14 +172,9 @@ class LaserPage(Page):
     def _picture_part(self) -> QWidget:
         tip = "A picture of the cross hair beside a scale"
         load = button("Load picture…", tip, self._choose_picture)
+        tip = "Distance between the two points marked on the scale"
         self.scale = NumberField(
-            "Scale length",
-            "mm",
-            lowest=0.1,
-            highest=10_000,
-            step=1,
-            decimals=2,
-            tooltip="Distance between the two points marked on the scale",
+            "Scale length", "mm", lowest=0.1, highest=10_000, step=1, decimals=2, tooltip=tip
         )
         self.scale.set_value(10.0)
         self.scale.edited.connect(lambda _: self._placed())

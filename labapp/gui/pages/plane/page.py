@@ -200,14 +200,9 @@ class PlanePage(Page):
         tip = "A picture of the target, taken by the camera in its place"
         load = button("Load picture…", tip, self._choose)
         self.kept_button = button("Picture in use", "Show what is in use again", self.take_kept)
+        tip = "From one flag of a bar to the next: measure it on the printed target"
         self.unit = NumberField(
-            "Unit of the axes",
-            "mm",
-            lowest=0.001,
-            highest=1000,
-            step=0.05,
-            decimals=3,
-            tooltip="From one flag of a bar to the next: measure it on the printed target",
+            "Unit of the axes", "mm", lowest=0.001, highest=1000, step=0.05, decimals=3, tooltip=tip
         )
         self.unit.set_value(presenter.UNIT_MM)
         self.unit.edited.connect(lambda _: self._unit_changed())
@@ -249,11 +244,8 @@ class PlanePage(Page):
         return FieldForm(self.print, save, self.saved)
 
     def _make_results(self) -> None:
-        self.model = ChoiceField(
-            "Use",
-            presenter.choices(None),
-            tooltip="How pixels map to the plane: a fit to the tick marks, or the three points",
-        )
+        tip = "How pixels map to the plane: a fit to the tick marks, or the three points"
+        self.model = ChoiceField("Use", presenter.choices(None), tooltip=tip)
         self.model.edited.connect(self.choose_model)
         tip = "Measure with this calibration; undo restores the former one"
         self.use_button, self.applied = button("Apply", tip, self.use), Message(2)

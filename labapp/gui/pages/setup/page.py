@@ -212,11 +212,8 @@ class SetupPage(Page):
     def _bench(self) -> QWidget:
         load = button("Load…", "Take all of the set-up from a setup file (TOML)", self._choose_load)
         save = button("Save…", "Write the set-up to a file, for another session", self._choose_save)
-        usual = button(
-            "Use defaults",
-            "Enter the dissertation's bench where nothing is entered; check each number",
-            self._use_defaults,
-        )
+        tip = "Enter the dissertation's bench where nothing is entered; check each number"
+        usual = button("Use defaults", tip, self._use_defaults)
         self._filling = load, usual
         self.status, self.sigma_words = Message(3), Message(2)
         buttons = column_of(hbox(load, save), usual)
@@ -246,11 +243,8 @@ class SetupPage(Page):
         form.add(heading("Expected pool"))
         for entry in POOL:
             self._add_noted(form, entry)
-        advise = button(
-            "Advise…",
-            "Where laser and plane should stand for such pools (Ctrl+Shift+A)",
-            lambda: self.workspace.action_requested.emit("adviser"),
-        )
+        tip = "Where laser and plane should stand for such pools (Ctrl+Shift+A)"
+        advise = button("Advise…", tip, lambda: self.workspace.action_requested.emit("adviser"))
         self.table = ResultTable("Rays that reach the imaging plane")
         self.others = wrapping_label()
         form.add(advise, self.table, self.others)

@@ -158,21 +158,13 @@ class SurfacePage(Page):
         self.canvas_parts.fit(self)
 
     def _section_fields(self) -> QWidget:
+        tip = "Direction of the section line: 0 along X, 90 along Y"
         self.angle = NumberField(
-            *("Section at", "°"),
-            lowest=-180,
-            highest=180,
-            step=5,
-            decimals=1,
-            tooltip="Direction of the section line: 0 along X, 90 along Y",
+            "Section at", "°", lowest=-180, highest=180, step=5, decimals=1, tooltip=tip
         )
+        tip = "How far to the left of the electrode the line passes"
         self.offset = NumberField(
-            *("offset", "mm"),
-            lowest=-50,
-            highest=50,
-            step=0.1,
-            decimals=2,
-            tooltip="How far to the left of the electrode the line passes",
+            "offset", "mm", lowest=-50, highest=50, step=0.1, decimals=2, tooltip=tip
         )
         for field in (self.angle, self.offset):
             field.label.setWordWrap(False)
@@ -194,13 +186,9 @@ class SurfacePage(Page):
             f"{HEIGHT_SIGMA_OF}; residuals are interpolated between the points",
         )
         self.colour.edited.connect(lambda key: self._set(colour=key))
+        tip = "How many times as high heights are drawn; the axis shows true heights"
         self.high = NumberField(
-            *("Heights ×", ""),
-            lowest=1,
-            highest=20,
-            step=1,
-            decimals=1,
-            tooltip="How many times as high heights are drawn; the axis shows true heights",
+            "Heights ×", "", lowest=1, highest=20, step=1, decimals=1, tooltip=tip
         )
         self.high.edited.connect(lambda value: self._set(exaggeration=value))
         self.high.editor.setMinimumWidth(NARROW_FIELD)  # a wider one would be cut off

@@ -80,11 +80,8 @@ class SurfacePanel:
 
     def _measuring(self) -> QGridLayout:
         self.one = button("&This frame", "Measure the frame in view (Shift+F5)", self.this_one)
-        self.missing = button(
-            "&Not measured",
-            "Measure every frame that is not measured or is out of date (F5)",
-            self.not_measured,
-        )
+        tip = "Measure every frame that is not measured or is out of date (F5)"
+        self.missing = button("&Not measured", tip, self.not_measured)
         self.all = button("A&ll frames", "Measure every frame again", self.all_frames)
         self.progress = QProgressBar()
         self.progress.setAccessibleName("How far the measurement is")

@@ -252,21 +252,13 @@ class TrendsPage(Page):
 
     def _make_signals(self) -> None:
         self.signals_words = wrapping_label()
+        tip = "Added to the table's times: where its time 0 lies in the recording"
         self.start = NumberField(
-            "Starts at",
-            "s",
-            lowest=-FAR_S,
-            highest=FAR_S,
-            step=0.01,
-            decimals=3,
-            tooltip="Added to the table's times: where its time 0 lies in the recording",
+            "Starts at", "s", lowest=-FAR_S, highest=FAR_S, step=0.01, decimals=3, tooltip=tip
         )
         self.start.edited.connect(self._start_at)
-        self.read_button = button(
-            "Load table…",
-            "Read current, voltage, wire feed from a table (CSV, TDMS); keep them in the session",
-            self.choose_signals,
-        )
+        tip = "Read current, voltage, wire feed from a table (CSV, TDMS); keep them in the session"
+        self.read_button = button("Load table…", tip, self.choose_signals)
         self.forget_button = button(
             "Remove",
             "Remove current and voltage from the session; undo restores them",
