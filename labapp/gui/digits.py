@@ -66,11 +66,6 @@ def with_thousands(entry: str) -> float | None:
     return parsed("".join(filter(None, grouped.groups())))
 
 
-def as_text(rows: Iterable[ResultRow]) -> str:
-    """Result rows as tab-separated lines, for a document."""
-    return "\n".join("\t".join(row.texts) for row in rows)
-
-
 def as_csv(rows: Iterable[ResultRow]) -> str:
     """Result rows as comma-separated values at full precision, for a program."""
     cells = ((row.name, row.value, row.sigma, row.unit) for row in rows)

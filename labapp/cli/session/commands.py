@@ -364,18 +364,15 @@ def export(
     with Session.open(file, read_only=True) as session, _counted(f"writing {out.name}") as progress:
         chosen = None if frames is None else choose_frames(session, frames)
         wanted = set(session.frames.tolist() if chosen is None else chosen)
-        missing = wanted & _not_measured(session, scheme)
+        seen = session.overview(scheme)
+        status = dict(zip(seen.frame.tolist(), seen.status, strict=True))
+        missing = {frame for frame in wanted if not status[frame]}
         files = session.export(
             out, choice, frames=chosen, scheme=scheme, report=report, progress=progress
         )
     if missing:
         typer.echo(f"Not measured, so not in it: {frames_text(missing)}")
     typer.echo(f"{pluralize(len(files), 'file')} and the manifest are in {out.absolute()}")
-
-
-def _not_measured(session: Session, scheme: str | None) -> set[int]:
-    seen = session.overview(scheme)
-    return {int(f) for f, status in zip(seen.frame, seen.status, strict=True) if not status}
 
 
 def _size(text: str) -> tuple[int, int]:

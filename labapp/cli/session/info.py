@@ -51,6 +51,11 @@ def _facts(session: Session) -> dict[str, Any]:
     seen, recording = session.overview(), session.recording
     laser, plane = session.laser_calibration, session.plane_calibration
     check = session.bench_check
+    entered = {
+        "laser readings": session.laser_entries,
+        "imaging-plane points": session.plane_entries,
+        "bench-check pictures": session.bench_entries,
+    }
     statuses = Counter(status or NOT_MEASURED for status in seen.status)
     missing = session.missing_recording
     return {
@@ -82,7 +87,7 @@ def _facts(session: Session) -> dict[str, Any]:
             "mirrors": [one.kind for one in check.pictures],
             "in_use": not session.setup_problems and bool(session.setup.check_date),
         },
-        "not_applied": [name for name, entries in _entries(session).items() if entries is not None],
+        "not_applied": [name for name, entries in entered.items() if entries is not None],
         "settings": _differences(session.settings, Settings()),
         "scheme": scheme_name(session.settings),
         "frames": len(seen.frame),
@@ -97,15 +102,6 @@ def _facts(session: Session) -> dict[str, Any]:
             "undoable": sum(not change.undone for change in session.history),
             "redoable": sum(change.undone for change in session.history),
         },
-    }
-
-
-def _entries(session: Session) -> dict[str, object]:
-    """Return what was entered on the pages of calibration and bench check, and not applied yet."""
-    return {
-        "laser readings": session.laser_entries,
-        "imaging-plane points": session.plane_entries,
-        "bench-check pictures": session.bench_entries,
     }
 
 
@@ -124,7 +120,10 @@ def _text(facts: dict[str, Any]) -> list[str]:
         ("session", f"{facts['file']} ({facts['size_bytes'] / 1e6:.1f} MB)"),
         ("record", _listed(facts["record"]) or "empty"),
         *_recording_lines(facts["recording"]),
-        *_setup_lines(facts["setup_lacks"]),
+        *(
+            ("set-up" * (not k), text)
+            for k, text in enumerate(facts["setup_lacks"] or ["complete"])
+        ),
         *_calibration_lines(facts),
         ("settings", _listed(facts["settings"]) or "all as usual"),
         ("frames", f"{facts['frames']}: {_counts(facts['statuses'])} ({facts['scheme']})"),
@@ -138,10 +137,6 @@ def _text(facts: dict[str, Any]) -> list[str]:
         for c in facts.get("history", ())
     ]
     return [printable(f"{name:11}{text}") for name, text in lines]
-
-
-def _setup_lines(lacks: list[str]) -> list[tuple[str, str]]:
-    return [("set-up" * (not k), text) for k, text in enumerate(lacks or ["complete"])]
 
 
 def _recording_lines(recording: dict[str, Any] | None) -> list[tuple[str, str]]:

@@ -141,7 +141,9 @@ class Live:
             if not self._closing.is_set():
                 self.feed = feed
                 self._recorders = [self._recorder(feed)]
-                self._begin_work()
+                show, judge = (partial(newest_of, each) for each in (self._to_show, self._to_judge))
+                self._begin(("dots", show, self._find_quickly, SHOW_S, 1.0))
+                self._begin(("verdict", judge, self._judge, LOOK_S, 1.0))
                 self._begin_measuring(feed)
                 return
         feed.stop()
@@ -210,10 +212,6 @@ class Live:
             recorder.note(event, time_s)
 
     # --- in threads of their own --------------------------------------------------------------
-
-    def _begin_work(self) -> None:
-        self._begin(("dots", partial(newest_of, self._to_show), self._find_quickly, SHOW_S, 1.0))
-        self._begin(("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S, 1.0))
 
     def _begin_measuring(self, feed: Feed) -> None:
         if self.setup is None or self._settings is None:

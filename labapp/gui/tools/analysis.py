@@ -179,9 +179,9 @@ class AnalysisWindow(ToolWindow):
 
     def _why_not(self) -> str:
         """Reason why what is ticked cannot be computed; empty if it can."""
-        ticked = self.parts[BUDGET].isChecked()
-        of = self.setup.value()
-        return presenter.why_no_budget(self.workspace.session, of) if ticked else ""
+        session = self.workspace.session
+        is_own = self.parts[BUDGET].isChecked() and self.setup.value() == OPENED
+        return presenter.LINES if is_own and session is not None and session.has_lines else ""
 
     def _budget(self) -> tuple[Setup | None, Pool]:
         """Set-up and pool chosen for the budget."""

@@ -56,11 +56,6 @@ def has_setup(session: Session | None) -> bool:
     return session is not None and not session.has_lines and not session.setup_problems
 
 
-def why_no_budget(session: Session | None, setup: str) -> str:
-    """Reason why the chosen set-up has no budget; empty if it may have one."""
-    return LINES if setup == OPENED and session is not None and session.has_lines else ""
-
-
 def setup_of(session: Session | None) -> SetupOf | None:
     """File and set-up, as text, of a session."""
     return None if session is None else (session.path, session.setup_text)

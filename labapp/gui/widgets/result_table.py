@@ -8,7 +8,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QCursor, QGuiApplication
 from PySide6.QtWidgets import QWhatsThis
 
-from labapp.gui.digits import ResultRow, as_csv, as_text
+from labapp.gui.digits import ResultRow, as_csv
 from labapp.gui.widgets.buttons import add_menu
 from labapp.gui.widgets.tables import FullTable
 from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF
@@ -50,7 +50,8 @@ class ResultTable(FullTable):
 
     def copy_text(self) -> None:
         """Copy the selected rows, or all, to the clipboard, separated by tabs."""
-        QGuiApplication.clipboard().setText(as_text(self._chosen()))
+        lines = ("\t".join(row.texts) for row in self._chosen())
+        QGuiApplication.clipboard().setText("\n".join(lines))
 
     def copy_csv(self) -> None:
         """Copy all rows to the clipboard as CSV, with all digits."""

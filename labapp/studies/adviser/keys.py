@@ -125,12 +125,13 @@ def parse_request(
     path = Path(source)
     problems = [unknown_key(path, key, TABLES) for key in values if key not in TABLES]
     for name, rules in TABLES.items():
-        if name == "pattern" and _is_of_lines(values.get(name)):
+        given = values.get(name)
+        if name == "pattern" and isinstance(given, dict) and given.get("kind") == LINES:
             right = "a pattern of dots: square, hexagonal or directions"
             problems.append(InputError(path, "pattern.kind", f'"{LINES}"', right))
         elif name == "pools" or name in values:
-            own = rules_for(name, values.get(name)) if name == "pattern" else rules
-            problems += check_keys(path, name, values.get(name), own)
+            own = rules_for(name, given) if name == "pattern" else rules
+            problems += check_keys(path, name, given, own)
     if problems:
         raise InputError.gather(problems)
     limits = _limits({name: values.get(name, {}) for name in TABLES})
@@ -151,11 +152,6 @@ def parse_request(
     except ValueError as error:
         key, _, why = str(error).partition(": ")
         raise InputError(path, f"pools.{key}", values["pools"].get(key), why) from error
-
-
-def _is_of_lines(pattern: object) -> bool:
-    """Whether a table ``[pattern]`` is of lines, for which there is no advice."""
-    return isinstance(pattern, dict) and pattern.get("kind") == LINES
 
 
 def _limits(tables: dict[str, dict[str, Any]]) -> BenchLimits:

@@ -9,6 +9,7 @@ from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate
 from labapp.media import GreyImage
 from labapp.session.record import BenchEntries, MirrorEntry, MirrorPicture
 from labapp.session.session import Session
+from labapp.text import capitalized
 
 KINDS = (("plate", "Flat plate"), ("cap", "Cap or thumb tack"), ("ball", "Bearing ball"))
 """Kinds of mirror, and their names."""
@@ -68,8 +69,7 @@ class ListedPicture:
     @property
     def mirror_words(self) -> str:
         """Text describing the mirror."""
-        name = self.mirror.name
-        return name[:1].upper() + name[1:]
+        return capitalized(self.mirror.name)
 
     @property
     def problem(self) -> str:

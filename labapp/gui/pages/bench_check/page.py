@@ -39,6 +39,7 @@ from labapp.gui.widgets.labels import (
 from labapp.gui.widgets.layouts import column_of, fill, hbox
 from labapp.gui.widgets.tables import FullTable, ReadTable
 from labapp.gui.workspace import Workspace
+from labapp.media.formats.images import IMAGE_SUFFIXES
 from labapp.session.record import BenchCheckRecord, BenchEntries, MirrorPicture
 
 NO_PICTURE = "Put a known mirror where the pool will be; add a picture of its dots, or drop it."
@@ -182,7 +183,7 @@ class BenchCheckPage(Page):
 
     def takes_files(self, paths: Sequence[Path]) -> bool:
         """Add dropped pictures."""
-        pictures = [path for path in paths if path.suffix.lower() in presenter.PICTURES]
+        pictures = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
         if why := no_bench_check(self.workspace.session):
             self._answer_in(self.answer).setText(why)
             return len(pictures) == len(paths)
@@ -245,10 +246,6 @@ class BenchCheckPage(Page):
         self._show_predicted(None)
         given = chosen, text, path, settings, tuple(free), pool
         self.start_latest("Checking the bench", given, work, found)
-
-    def find_suspect(self) -> None:
-        """Repeat the check, with a quantity determined from the pictures alone."""
-        self.check([self.suspect.value()])
 
     def use(self) -> None:
         """Use the adjusted set-up."""
@@ -324,7 +321,7 @@ class BenchCheckPage(Page):
         tip = "Which quantity is off; those in the list explain the dots equally well"
         self.suspect = ChoiceField("What is off", tooltip=tip)
         tip = "Check again with this quantity free: its entered value is ignored"
-        find = button("Find it from the pictures", tip, self.find_suspect)
+        find = button("Find it from the pictures", tip, lambda: self.check([self.suspect.value()]))
         # Names are long, so the label is above them.
         self.suspect_part = column_of(self.suspect.label, self.suspect, find)
         return self.suspect_part

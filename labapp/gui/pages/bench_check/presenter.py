@@ -33,13 +33,9 @@ from labapp.core.images.find_dots import DotSettings, find_mirror_dots
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.gui.digits import round_factor
 from labapp.gui.pages.bench_check.listed_picture import ListedPicture
-from labapp.media.formats.images import IMAGE_SUFFIXES
 from labapp.session.record import BenchCheckRecord, MirrorPicture, Record
 from labapp.session.session import Session
 from labapp.text import capitalized, now, plain, with_sigma
-
-PICTURES = IMAGE_SUFFIXES
-"""Suffixes of pictures that can be dropped on the page."""
 
 REACH_PX = 8.0
 """Largest distance, px, of the pointer from a dot."""
@@ -333,7 +329,8 @@ def overlay(picture: MirrorPicture, height_px: int) -> Overlay:
     residual = picture.computed_px - picture.dot_px
     length = np.hypot(*residual.T)
     # Nine of ten end before the next dot, so that the dots stay visible.
-    longest = min(height_px / 30, _spacing_px(picture.dot_px))
+    spacing = float(np.median(cKDTree(picture.dot_px).query(picture.dot_px, k=2)[0][:, 1]))
+    longest = min(height_px / 30, spacing)
     times = round_factor(longest / max(float(np.quantile(length, 0.9)), 1e-6))
     ends = picture.dot_px + times * residual
     arrows = np.stack([picture.dot_px, ends], axis=1).reshape(-1, 2)
@@ -343,12 +340,6 @@ def overlay(picture: MirrorPicture, height_px: int) -> Overlay:
         f"longest is {longest_um:.0f} µm. i, j: row and column of the ray"
     )
     return Overlay(picture.dot_px, arrows, _numbers(picture), words)
-
-
-def _spacing_px(dot_px: FloatArray) -> float:
-    """Median distance between nearest dots."""
-    distance, _ = cKDTree(dot_px).query(dot_px, k=2)
-    return float(np.median(distance[:, 1]))
 
 
 def _numbers(picture: MirrorPicture) -> tuple[tuple[str, float, float, bool], ...]:

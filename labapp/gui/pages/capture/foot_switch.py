@@ -15,6 +15,7 @@ from labapp.gui.widgets.labels import heading, selectable_label, show_words
 from labapp.gui.widgets.layouts import Group, column_of, fill, hbox
 from labapp.media.devices.foot_switch import PedalAction
 from labapp.media.devices.hid import commands
+from labapp.text import capitalized
 
 NOTHING = "nothing"
 
@@ -122,7 +123,7 @@ class FootSwitchPanel(Group):
                     headed_by = key
                 name = pedal_name(pedal, held[key].keyboard)
                 field = self.pedals[key, pedal] = ChoiceField(
-                    name[:1].upper() + name[1:],
+                    capitalized(name),
                     CHOICES,
                     tooltip=f"What {name} of {held[key].name} does",
                 )

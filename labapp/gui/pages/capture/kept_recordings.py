@@ -45,11 +45,6 @@ class KeptRecordings(Group):
         self.setVisible(bool(kept))
 
 
-def kept_text(take: Take, why_kept: str) -> str:
-    """Text about a recording that is kept but not imported."""
-    return f"{take.path.name} is under Other recordings ({why_kept})"
-
-
 def _choice_text(path: Path) -> str:
     """Name of a recording beside the session, and whether another session uses it."""
     used = path.with_suffix(SUFFIX).exists()

@@ -13,7 +13,7 @@ from labapp.gui.dialogs import ask_file, ask_folder, ask_recording
 from labapp.gui.live.view import LiveView
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
 from labapp.gui.pages.capture.import_choice import ImportChoice
-from labapp.gui.pages.capture.kept_recordings import KeptRecordings, kept_text
+from labapp.gui.pages.capture.kept_recordings import KeptRecordings
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
@@ -176,7 +176,7 @@ class CapturePage(Page):
         if why_kept:
             self._listed = None
             self._show_import()
-            self.confirm(kept_text(take, why_kept))
+            self.confirm(f"{take.path.name} is under Other recordings ({why_kept})")
         else:
             measured = self.live_view.plan_fields.measured.isChecked()
             self._import(take.path, None, self._measure if measured else _nothing)

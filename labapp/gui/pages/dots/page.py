@@ -30,12 +30,14 @@ from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import recording_gone
 from labapp.gui.views.drag_point import SHIFT, arrow_step
 from labapp.gui.views.picture import PictureView, Tool
-from labapp.gui.widgets.layouts import fill
+from labapp.gui.widgets.layouts import fill, reveal
 from labapp.gui.workspace import Workspace
 
 NO_REFERENCE = "If you know the reference from other frames, press Reference"
 
 NOT_YET = "The frame is being measured as it was found: edit it when its rows are there"
+
+BY_KEY = Qt.FocusReason.ShortcutFocusReason
 
 REACH = 9.0
 """Largest distance of the pointer from a dot to select it, points of the screen."""
@@ -229,7 +231,7 @@ class DotsPage(Page):
         is_new = words != self.dots_panel.chosen.text()
         self.dots_panel.show_chosen(words, editor.rows, site)
         if is_new and editor.selection.size and self.view.hasFocus():
-            self.dots_panel.reveal_edits()  # not if the pointer is in the panel
+            reveal(*self.dots_panel.edit_buttons)  # not if the pointer is in the panel
         self._show_unmet_needs()
 
     def _show_unmet_needs(self) -> None:
@@ -300,15 +302,12 @@ class DotsPage(Page):
             self._before = before  # edits before the fit is done are compared as one
         done = self.workspace.attempt(
             lambda session: session.correct({seen.frame: edit()}, f"{label}, frame {seen.frame}"),
-            beside=self._set_refusal,
+            beside=partial(setattr, self.editor, "refusal"),
         )
         if not done:
             self._before = before
             self.draw()
         return done
-
-    def _set_refusal(self, words: str) -> None:
-        self.editor.refusal = words
 
     def _assign(self, what: str, value: float | None) -> None:
         if value is not None:
@@ -355,9 +354,6 @@ class DotsPage(Page):
             self.draw()
         else:
             self.choose(self.editor.choose_none)
-
-    def _type_row(self) -> None:
-        self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
 
     # --- keys and buttons ---------------------------------------------------------------------
 
@@ -441,7 +437,8 @@ class DotsPage(Page):
                     lambda: self.choose(editor.choose_next, -1)),
             Command("Whole row", "W", "Select all dots in the rows of the selected ones",
                     lambda: self.choose(editor.choose_rows, editor.rows)),
-            Command("Type a row", "T", "Type the row of the selected dots", self._type_row, "dots"),
+            Command("Type a row", "T", "Type the row of the selected dots",
+                    lambda: self.dots_panel.row.editor.setFocus(BY_KEY), "dots"),
             Command("Hide marks", "H", "Hide the marks, or show them again",
                     self.overlay.toggle),
         )  # fmt: skip

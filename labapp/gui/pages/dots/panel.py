@@ -30,7 +30,7 @@ from labapp.gui.shell.lead import action_grid
 from labapp.gui.shell.steps import MEASURE_ACTIONS, SETUP_ACTIONS
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.widgets.labels import Message, heading, offer, plain_label
-from labapp.gui.widgets.layouts import Group, reveal, vbox
+from labapp.gui.widgets.layouts import Group, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
 from labapp.text import capitalized
@@ -107,10 +107,6 @@ class DotsPanel(QWidget):
         self.rows.choose(rows)
         self.row.set_value(site[0] or None)
         self.column.set_value(site[1] or None)
-
-    def reveal_edits(self) -> None:
-        """Scroll to the buttons of the edits, which may be out of view on a small screen."""
-        reveal(*self.edit_buttons)
 
     def show_unmet_needs(self, unmet_need: Mapping[str, str]) -> bool:
         """Disable the buttons of edits with unmet needs, given by the buttons' texts.

@@ -110,7 +110,7 @@ def shown(session: Session, frame: int, found: DetectedDots | None) -> DotsState
     if correction is not None:
         why = damage if result is None or result.stale else result.measurement.reason
         return DotsState(frame, "corrected", correction, computed, result, why)
-    by = _by(session)
+    by = session.settings.dots, session.settings.lattice
     if result is not None and _automatic(result, by):
         measurement = result.measurement
         start = start_correction(measurement)
@@ -132,11 +132,6 @@ def _result(session: Session, frame: int) -> tuple[Result | None, str]:
         return session.result(frame), ""
     except InputError as error:
         return None, f"{error}; measure the frame again"
-
-
-def _by(session: Session) -> tuple[DotSettings, LatticeSettings]:
-    settings = session.settings
-    return settings.dots, settings.lattice
 
 
 def _automatic(result: Result, by: tuple[DotSettings, LatticeSettings]) -> bool:

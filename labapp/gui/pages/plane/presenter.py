@@ -30,6 +30,7 @@ from labapp.session.file.stored import LARGEST_PX
 from labapp.session.record import PlanePicture
 from labapp.session.session import Session
 from labapp.simulation.calibration.target import Target
+from labapp.text import capitalized
 
 POINTS = ("O′", "O′X′", "O′Z′")
 """Names of the three points: the origin, and the centres of the two bars."""
@@ -250,11 +251,8 @@ def why(found: Calibration | None) -> str:
         return ""
     if found.fits is None:
         return "Only the three points are used: tick marks were not found, or points were moved"
-    return "\n".join((f"{found.fits.reason}.", *(f"{words}." for words in _capital(found))))
-
-
-def _capital(found: PlaneCalibration) -> list[str]:
-    return [words[0].upper() + words[1:] for words in found.bound_words()]
+    sentences = (found.fits.reason, *map(capitalized, found.bound_words()))
+    return "\n".join(f"{words}." for words in sentences)
 
 
 @dataclass(frozen=True)

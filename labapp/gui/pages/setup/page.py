@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,6 @@ from labapp.gui.widgets.layouts import column_of, fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick, ticked
-from labapp.session.session import Session
 from labapp.text import local_time, now
 
 ENTRIES = {entry.key: entry for _, entries in RIG for entry in entries}
@@ -225,7 +223,8 @@ class SetupPage(Page):
                     "Dots, and how they lie to each other, or lines. "
                     "Measured rays come with a setup file: Load…"
                 )
-                self.kind = self._choice("Kind", KINDS, tip, presenter.put_kind)
+                self.kind = ChoiceField("Kind", KINDS, tooltip=tip)
+                self.change_when_edited(self.kind, presenter.put_kind)
                 self.pattern = PatternView()
                 form.add(self.kind, self.pattern)
             for entry in entries:
@@ -234,7 +233,8 @@ class SetupPage(Page):
                 form.add(field, beside=None if sigma is None else self._sigma_field(sigma))
             if title == "Torch":
                 tip = "Where the pool's head is: +Y is the laser's side. The rear may lie lower"
-                self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)
+                self.travel = ChoiceField("Welding", TRAVELS, tooltip=tip)
+                self.change_when_edited(self.travel, presenter.put_travel)
                 form.add(self.travel)
         title, entries = UNCERTAIN_ONLY
         form.add(heading(f"{title}, ±"))
@@ -249,17 +249,6 @@ class SetupPage(Page):
         self.others = wrapping_label()
         form.add(advise, self.table, self.others)
         return form
-
-    def _choice(
-        self,
-        label: str,
-        options: Sequence[tuple[str, str]],
-        tooltip: str,
-        put: Callable[[Session, str], None],
-    ) -> ChoiceField:
-        field = ChoiceField(label, options, tooltip=tooltip)
-        self.change_when_edited(field, put)
-        return field
 
     def _put_field(self, entry: Entry) -> NumberField:
         """A field that enters its number in the set-up."""

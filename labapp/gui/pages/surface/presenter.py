@@ -327,7 +327,8 @@ def scene(
     made = scene_of(reconstruction, options.colour, limits if options.colour == "height" else None)
     lines = dict(made.lines_mm) if options.boundary else {}
     if cut is not None:
-        lines["section"] = section_line(cut)
+        known = np.isfinite(cut.height_mm)
+        lines["section"] = np.column_stack([cut.place_mm[known], cut.height_mm[known]])
     return replace(
         made,
         points_mm=made.points_mm if options.points else made.points_mm[:0],
@@ -339,12 +340,6 @@ def scene(
         exaggeration=options.exaggeration,
         stamp="out of date" if stale else "",
     )
-
-
-def section_line(cut: Profile) -> FloatArray:
-    """A profile as a line on the surface, shape (n, 3), mm."""
-    known = np.isfinite(cut.height_mm)
-    return np.column_stack([cut.place_mm[known], cut.height_mm[known]])
 
 
 def reflected_dots(measurement: Measurement) -> tuple[FloatArray, FloatArray] | None:
