@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import Literal
 
 from PySide6.QtCore import QMimeData, Qt
-from PySide6.QtWidgets import QFileDialog, QMessageBox, QWidget
+from PySide6.QtWidgets import QFileDialog, QMessageBox, QPushButton, QWidget
 
 from labapp.session.file.database import SUFFIX
 
 SESSIONS = f"Sessions (*{SUFFIX})"
 SETUP_FILES = "Setup files (*.toml)"
 EVERYTHING = "All files (*)"
+
+Role = QMessageBox.ButtonRole
 
 
 def recordings() -> str:
@@ -75,21 +77,16 @@ def ask_setup(parent: QWidget, folder: Path) -> Path | None:
 
 def ask_read_only(parent: QWidget, path: Path, in_use: bool = True) -> bool:
     """Offer to open a session read-only because it is open elsewhere, or cannot be written."""
-    box = QMessageBox(parent)
-    box.setObjectName("read-only")
-    box.setIcon(QMessageBox.Icon.Question)
-    box.setWindowTitle("The session is in use" if in_use else "The session cannot be written")
-    box.setTextFormat(Qt.TextFormat.PlainText)
-    why = "is open in another window or program" if in_use else "or its folder cannot be written"
-    until = (
-        "it is closed there" if in_use else "it is copied, with its recording, to another folder"
-    )
-    box.setText(f"{path.name} {why}.")
-    box.setInformativeText(
-        f"You can look at it read-only: nothing can be changed or measured in it until {until}."
-    )
-    look = box.addButton("Open &read-only", QMessageBox.ButtonRole.AcceptRole)
-    look.setToolTip("Look at the session without changing it")
+    if in_use:
+        title, why = "The session is in use", "is open in another window or program"
+        until = "it is closed there"
+    else:
+        title, why = "The session cannot be written", "or its folder cannot be written"
+        until = "it is copied, with its recording, to another folder"
+    more = f"You can look at it read-only: nothing can be changed or measured in it until {until}."
+    box = _question(parent, "read-only", title, f"{path.name} {why}.", more)
+    tip = "Look at the session without changing it"
+    look = _answer(box, "Open &read-only", Role.AcceptRole, tip)
     cancel = box.addButton(QMessageBox.StandardButton.Cancel)
     cancel.setToolTip("Leave it closed (Esc)")
     box.setDefaultButton(look)
@@ -99,19 +96,11 @@ def ask_read_only(parent: QWidget, path: Path, in_use: bool = True) -> bool:
 
 def ask_delete_draft(parent: QWidget, path: Path) -> bool:
     """Ask whether to delete a draft."""
-    box = QMessageBox(parent)
-    box.setObjectName("delete-draft")
-    box.setIcon(QMessageBox.Icon.Question)
-    box.setWindowTitle("Delete draft")
-    box.setTextFormat(Qt.TextFormat.PlainText)
-    box.setText(f"Delete the draft “{path.stem}”?")
-    box.setInformativeText(
-        "Its set-up, corrections and results are lost. The recording stays where it is."
-    )
-    delete = box.addButton("&Delete", QMessageBox.ButtonRole.DestructiveRole)
-    delete.setToolTip("Delete the draft for good")
-    keep = box.addButton("&Keep", QMessageBox.ButtonRole.RejectRole)
-    keep.setToolTip("Delete nothing (Esc)")
+    words = f"Delete the draft “{path.stem}”?"
+    more = "Its set-up, corrections and results are lost. The recording stays where it is."
+    box = _question(parent, "delete-draft", "Delete draft", words, more)
+    delete = _answer(box, "&Delete", Role.DestructiveRole, "Delete the draft for good")
+    keep = _answer(box, "&Keep", Role.RejectRole, "Delete nothing (Esc)")
     box.setDefaultButton(keep)
     box.setEscapeButton(keep)
     box.exec()
@@ -120,28 +109,37 @@ def ask_delete_draft(parent: QWidget, path: Path) -> bool:
 
 def ask_recording_end(parent: QWidget, name: str) -> Literal["keep", "discard", "go on"]:
     """Ask what to do with a running recording when its session is to be closed."""
-    box = QMessageBox(parent)
-    box.setObjectName("recording-runs")
-    box.setIcon(QMessageBox.Icon.Question)
-    box.setWindowTitle("A recording is running")
-    box.setTextFormat(Qt.TextFormat.PlainText)
-    box.setText(f"{name} is still being recorded.")
-    box.setInformativeText(
+    more = (
         "To close, the recording is ended. A finished one is kept beside the session and listed "
         "in the step Recording."
     )
-    keep = box.addButton("&Finish and keep", QMessageBox.ButtonRole.AcceptRole)
-    keep.setToolTip("End the recording, write all of it, and close")
-    discard = box.addButton("&Discard", QMessageBox.ButtonRole.DestructiveRole)
-    discard.setToolTip("End the recording, delete its file, and close")
-    go_on = box.addButton("&Go on recording", QMessageBox.ButtonRole.RejectRole)
-    go_on.setToolTip("Keep everything open (Esc)")
+    words = f"{name} is still being recorded."
+    box = _question(parent, "recording-runs", "A recording is running", words, more)
+    tip = "End the recording, write all of it, and close"
+    keep = _answer(box, "&Finish and keep", Role.AcceptRole, tip)
+    tip = "End the recording, delete its file, and close"
+    discard = _answer(box, "&Discard", Role.DestructiveRole, tip)
+    go_on = _answer(box, "&Go on recording", Role.RejectRole, "Keep everything open (Esc)")
     box.setDefaultButton(keep)
     box.setEscapeButton(go_on)
     box.exec()
     if box.clickedButton() is keep:
         return "keep"
     return "discard" if box.clickedButton() is discard else "go on"
+
+
+def _question(parent: QWidget, name: str, title: str, words: str, more: str) -> QMessageBox:
+    box = QMessageBox(QMessageBox.Icon.Question, title, words, parent=parent)
+    box.setObjectName(name)
+    box.setTextFormat(Qt.TextFormat.PlainText)
+    box.setInformativeText(more)
+    return box
+
+
+def _answer(box: QMessageBox, words: str, role: Role, tip: str) -> QPushButton:
+    button = box.addButton(words, role)
+    button.setToolTip(tip)
+    return button
 
 
 def new_path(folder: Path, stem: str, suffix: str = SUFFIX) -> Path:
