@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from labapp.bundled import SAMPLE_TEXTS, bundled
 from labapp.errors import InputError
@@ -26,54 +27,36 @@ class SampleSession:
     """Frame rate of a recording without a time base."""
 
 
-SIMULATED = "Simulated: labapp.simulation.samples."
+def _noted(name: str, notes: str = "", **values: Any) -> Record:
+    notes = f"Simulated: labapp.simulation.samples. {notes}".strip()
+    return Record(title=SAMPLE_TEXTS[name].title, operator="labapp", notes=notes, **values)
+
 
 SAMPLES = {
     "gtaw": SampleSession(
         "recording.avi",
-        Record(
-            title=SAMPLE_TEXTS["gtaw"].title,
-            operator="labapp",
+        _noted(
+            "gtaw",
             current_a=75.0,
             travel_speed_mm_s=3.0,
             expected_width_mm=6.7,
             expected_length_mm=7.4,
             expected_height_mm=0.3,
-            notes=SIMULATED,
         ),
     ),
     "thumb_tack": SampleSession(
         "recording.tif",
-        Record(
-            title=SAMPLE_TEXTS["thumb_tack"].title,
-            operator="labapp",
-            expected_width_mm=9.75,
-            expected_length_mm=9.75,
-            expected_height_mm=0.91,
-            notes=SIMULATED,
+        _noted(
+            "thumb_tack", expected_width_mm=9.75, expected_length_mm=9.75, expected_height_mm=0.91
         ),
     ),
     "blocked_rows": SampleSession(
         "recording.mkv",
-        Record(
-            title=SAMPLE_TEXTS["blocked_rows"].title,
-            operator="labapp",
-            notes=f"{SIMULATED} Frame 2 was corrected by hand, frames 3 to 5 were not.",
-        ),
+        _noted("blocked_rows", "Frame 2 was corrected by hand, frames 3 to 5 were not."),
     ),
-    "concave": SampleSession(
-        "recording",
-        Record(title=SAMPLE_TEXTS["concave"].title, operator="labapp", notes=SIMULATED),
-    ),
-    "five_lines": SampleSession(
-        "recording.avi",
-        Record(title=SAMPLE_TEXTS["five_lines"].title, operator="labapp", notes=SIMULATED),
-    ),
-    "gmaw": SampleSession(
-        "recording.tif",
-        Record(title=SAMPLE_TEXTS["gmaw"].title, operator="labapp", notes=SIMULATED),
-        frame_rate_hz=1500.0,
-    ),
+    "concave": SampleSession("recording", _noted("concave")),
+    "five_lines": SampleSession("recording.avi", _noted("five_lines")),
+    "gmaw": SampleSession("recording.tif", _noted("gmaw"), frame_rate_hz=1500.0),
 }
 
 
