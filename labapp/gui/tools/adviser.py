@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtWidgets import QTabWidget, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import adviser_presenter as presenter
@@ -13,7 +13,7 @@ from labapp.gui.tools.tool import WORKING, ToolWindow, progress_of
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
 from labapp.gui.widgets.labels import heading, offer, wrapping_label
-from labapp.gui.widgets.layouts import Group, fill, scrolled
+from labapp.gui.widgets.layouts import Group, fill, scrolled, tabs_of
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
@@ -37,19 +37,13 @@ RANGES = (
     ("bench.h_mm", "Plane, h", "mm", -500, 500, 1, "How high O′ can be"),
 )
 NUMBERS = (
-    (
-        "pools.shift_mm",
-        "Offset from electrode",
-        0,
-        5,
-        0.1,
-        "How far a pool's middle is off it at most",
-    ),
+    ("pools.shift_mm", "Offset from electrode", 0, 5, 0.1,
+        "How far a pool's middle is off it at most"),
     ("bench.width_mm", "Plane's width", 10, 1000, 1, "Along O′X′"),
     ("bench.height_mm", "Plane's height", 10, 1000, 1, "Along O′Z′"),
     ("bench.edge_mm", "Edge", 0, 50, 0.5, "How far dots stay within the plane's edges"),
     ("bench.electrode_height_mm", "Electrode height", 0, 50, 0.5, "Work piece to the tip"),
-)
+)  # fmt: skip
 
 
 class AdviserWindow(ToolWindow):
@@ -101,10 +95,8 @@ class AdviserWindow(ToolWindow):
         fill(QVBoxLayout(self.words), self.headline, *self.groups, 1)
         for group in self.groups:
             group.hide()
-        self.tabs = QTabWidget()
-        self.tabs.tabBar().setAccessibleName("Parts of the advice")
-        self.tabs.addTab(scrolled(self.words, "Advice"), "Advice")
-        self.tabs.addTab(self.sheet, "Picture")
+        parts = {"Advice": scrolled(self.words, "Advice"), "Picture": self.sheet}
+        self.tabs = tabs_of("Parts of the advice", parts)
         self.results.addWidget(self.tabs)
 
     def _make_buttons(self) -> None:

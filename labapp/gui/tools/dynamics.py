@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QCloseEvent
-from PySide6.QtWidgets import QAbstractItemView, QSizePolicy, QTabWidget, QWidget
+from PySide6.QtWidgets import QAbstractItemView, QSizePolicy, QWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import dynamics_presenter as presenter
@@ -16,7 +16,7 @@ from labapp.gui.tools.tool import WORKING, ToolWindow
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
 from labapp.gui.widgets.labels import heading, offer, wrapping_label
-from labapp.gui.widgets.layouts import column_of, hbox
+from labapp.gui.widgets.layouts import column_of, hbox, tabs_of
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 
@@ -91,20 +91,16 @@ class DynamicsWindow(ToolWindow):
             table.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
             table.itemSelectionChanged.connect(changed)
         self.events.cellActivated.connect(lambda *_: self.show_frame())
-        self.tabs = QTabWidget()
-        self.tabs.tabBar().setAccessibleName("Parts of the analysis")
-        for words, parts in (
-            ("Spectrum", (self.peak_words, (self.spectrum, 1))),
-            ("Modes", ((self.modes, 4), (self.shape, 7), hbox(self.play_button, 1))),
-            (
-                "Events",
-                (self.event_words, (self.series, 3), (self.events, 2), hbox(self.frame_button, 1)),
-            ),
-            ("Responses", ((self.response_words, 1), (self.responses, 1))),
-        ):
-            page = column_of(*parts)
+        play, frame = hbox(self.play_button, 1), hbox(self.frame_button, 1)
+        pages = {
+            "Spectrum": column_of(self.peak_words, (self.spectrum, 1)),
+            "Modes": column_of((self.modes, 4), (self.shape, 7), play),
+            "Events": column_of(self.event_words, (self.series, 3), (self.events, 2), frame),
+            "Responses": column_of((self.response_words, 1), (self.responses, 1)),
+        }
+        for page in pages.values():
             page.setContentsMargins(6, 6, 6, 6)
-            self.tabs.addTab(page, words)
+        self.tabs = tabs_of("Parts of the analysis", pages)
         for label in (self.peak_words, self.event_words, self.response_words):
             label.setAlignment(Qt.AlignmentFlag.AlignTop)
         # The sheets scroll: the tabs do not need the height that they would like to have.

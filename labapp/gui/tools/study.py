@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from PySide6.QtCore import QUrl
 from PySide6.QtGui import QCloseEvent, QDesktopServices, QDragEnterEvent, QDropEvent
-from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QHeaderView, QTabWidget, QWidget
+from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QHeaderView, QWidget
 
 from labapp.gui.dialogs import SETUP_FILES, ask_file, ask_folder, ask_save, dropped_paths
 from labapp.gui.tasks import Control, Tasks
@@ -25,7 +25,7 @@ from labapp.gui.widgets.fields import (
     whole,
 )
 from labapp.gui.widgets.labels import heading, offer, show_words, wrapping_label
-from labapp.gui.widgets.layouts import column_of
+from labapp.gui.widgets.layouts import column_of, tabs_of
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable, FittingTable
@@ -124,15 +124,8 @@ class StudyWindow(ToolWindow):
         self.against.edited.connect(lambda _: self._draw())
         self.sheet = Sheet("Plots of the study")
         plots = column_of(FieldForm(self.against), (self.sheet, 1))
-        self.tabs = QTabWidget()
-        self.tabs.tabBar().setAccessibleName("Parts of the study")
-        for widget, words in (
-            (self.list, "Recordings"),
-            (plots, "Plots"),
-            (self.means, "Means"),
-            (self.outliers, "Outliers"),
-        ):
-            self.tabs.addTab(widget, words)
+        parts = {"Recordings": self.list, "Plots": plots, "Means": self.means}
+        self.tabs = tabs_of("Parts of the study", {**parts, "Outliers": self.outliers})
         for table in (self.list, self.outliers):
             table.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
             table.itemSelectionChanged.connect(self.show_state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TypeVar
 
 from PySide6.QtCore import Qt
@@ -12,6 +13,7 @@ from PySide6.QtWidgets import (
     QHBoxLayout,
     QLayout,
     QScrollArea,
+    QTabWidget,
     QVBoxLayout,
     QWidget,
 )
@@ -60,6 +62,15 @@ def row_of(*parts: Part) -> QWidget:
     made = QWidget()
     hbox(*parts, of=made)
     return made
+
+
+def tabs_of(name: str, pages: Mapping[str, QWidget]) -> QTabWidget:
+    """Tabs of pages, by their titles; ``name`` is for a screen reader."""
+    tabs = QTabWidget()
+    tabs.tabBar().setAccessibleName(name)
+    for title, page in pages.items():
+        tabs.addTab(page, title)
+    return tabs
 
 
 class _ScrollArea(QScrollArea):

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtWidgets import QCheckBox, QLabel, QTabWidget, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QCheckBox, QLabel, QVBoxLayout, QWidget
 
 from labapp.files import write_file
 from labapp.gui.dialogs import SETUP_FILES, ask_save, ask_setup
@@ -29,7 +29,7 @@ from labapp.gui.views.drawings.pattern import PatternView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_label
-from labapp.gui.widgets.layouts import column_of, fill, hbox
+from labapp.gui.widgets.layouts import column_of, fill, hbox, tabs_of
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick, ticked
@@ -58,8 +58,6 @@ class SetupPage(Page):
         self._times: dict[str, QLabel] = {}
         self._drawn: object = None
         self._recorded: object = None
-        self.tabs = QTabWidget()
-        self.tabs.tabBar().setAccessibleName("Parts of the set-up")
         safety, preparation = self._list(self.ticks, SAFETY), QWidget()
         lists = (("Equipment", EQUIPMENT), ("Steps", STEPS))
         layout = QVBoxLayout(preparation)
@@ -68,8 +66,8 @@ class SetupPage(Page):
             layout.addWidget(self._list(self.steps, items))
         contents = (self._experiment(), safety, self._bench(), preparation)
         titles = ("Experiment", "Safety", "Bench", "Steps")
-        for content, title in zip(contents, titles, strict=True):
-            self.tabs.addTab(_top(content), title)
+        pages = dict(zip(titles, map(_top, contents), strict=True))
+        self.tabs = tabs_of("Parts of the set-up", pages)
 
         def show_tab(number: int) -> None:
             # Otherwise the other tabs could be scrolled to the height of the highest one.
