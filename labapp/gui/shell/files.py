@@ -70,15 +70,13 @@ class Files(QObject):
 
     def choose(self) -> None:
         """Ask for a session and open it."""
-        path = dialogs.ask_session(self._window, self.preferences.current.folder)
-        if path is not None:
+        if path := dialogs.ask_session(self._window, self.preferences.current.folder):
             self.open(path)
 
     def open_recording(self) -> None:
         """Ask for a recording and show it immediately in a draft."""
         folder = self.preferences.current.folder
-        path = dialogs.ask_recording(self._window, folder, "Open recording")
-        if path is not None:
+        if path := dialogs.ask_recording(self._window, folder, "Open recording"):
             self.begin_draft(path)
 
     def begin_draft(self, recording: Path) -> None:
@@ -142,8 +140,7 @@ class Files(QObject):
 
     def choose_recording(self) -> None:
         """Ask for a recording and import it into the session."""
-        path = dialogs.ask_recording(self._window, self.preferences.current.folder)
-        if path is not None:
+        if path := dialogs.ask_recording(self._window, self.preferences.current.folder):
             self.take(path)
 
     def open_path(self, path: Path) -> None:

@@ -43,14 +43,12 @@ class Setups(QObject):
 
     def load(self) -> None:
         """Ask for a setup file and use it."""
-        path = dialogs.ask_setup(self._window, self.workspace.folder)
-        if path is not None:
+        if path := dialogs.ask_setup(self._window, self.workspace.folder):
             self._use(lambda session: load_setup(session, path), path.name)
 
     def use_other(self) -> None:
         """Ask for another session and use its set-up."""
-        path = dialogs.ask_session(self._window, self.workspace.folder)
-        if path is not None:
+        if path := dialogs.ask_session(self._window, self.workspace.folder):
             self._use_session(path)
 
     def use_last(self) -> None:
