@@ -11,26 +11,17 @@ from labapp.studies import SCHEME_NAMES
 BUDGET = "budget"
 
 PARTS = (
-    (
-        BUDGET,
-        "Error budget of the set-up",
-        "What each source does to the height of the expected pool, with fit",
-    ),
+    (BUDGET, "Error budget of the set-up",
+        "What each source does to the height of the expected pool, with fit"),
     ("CE", "CE: configuration (a minute)", "28 caps, the laser where it stood in §8.3.1"),
-    (
-        "LE",
-        "LE: system limitation (10 min)",
-        "The least error of the caps with the laser at 25° to 35° and 25 to 35 mm",
-    ),
+    ("LE", "LE: system limitation (10 min)",
+        "The least error of the caps with the laser at 25° to 35° and 25 to 35 mm"),
     ("ME", "ME: methodology (10 min)", "The same as LE with 39 × 39 rays, 0.385° apart"),
     ("measurement", "Thumb tack of §8.2 (a minute)", "Rendered frames of it, measured"),
     ("images", "Image processing (minutes)", "Rendered frames of the 28 caps, measured"),
-    (
-        "parameters",
-        "Parameter deviation (minutes)",
-        "What the calibration's uncertainties do, one by one and by Monte Carlo",
-    ),
-)
+    ("parameters", "Parameter deviation (minutes)",
+        "What the calibration's uncertainties do, one by one and by Monte Carlo"),
+)  # fmt: skip
 """Parts that can be computed: key, text and explanation."""
 
 SCHEME_CHOICES = (("", "all of them"), *((scheme, scheme) for scheme in SCHEME_NAMES))

@@ -71,51 +71,28 @@ class Item:
 def groups() -> tuple[tuple[str, tuple[Item, ...]], ...]:
     """Items that can be ticked: (heading, items) of each group."""
     return (
-        (
-            "Tables (CSV)",
-            (
-                Item("tables:measures", "Measures", "One row per frame: width, length, height…"),
-                Item("tables:dots", "Dots", "One row per dot: its place, row, column and ray"),
-                Item("tables:points", "Points", "One row per reflection point, with its residual"),
-                Item("tables:boundary", "Boundary", "The pool's boundary, point by point"),
-            ),
-        ),
-        (
-            "Surfaces, one file per frame",
-            (
-                *_formats("surfaces", SURFACE_FORMATS),
-                Item(
-                    "solid",
-                    "Also as solids",
-                    "Each surface as a watertight body, mesh formats only",
-                ),
-            ),
-        ),
-        (
-            "Pictures, film (MP4)",
-            (
-                Item("pictures:frames", "Frames", "Each frame with its dots, rows and columns"),
-                Item(
-                    "pictures:surfaces",
-                    "Surfaces",
-                    "Each surface in 3-D, seen from where you choose",
-                ),
-                Item("pictures:trends", "Trends", "Width, length and height over time"),
-                Item(
-                    "pictures:film", "Film", "The surface in 3-D over all frames, each at its time"
-                ),
-            ),
-        ),
-        (
-            "Everything together",
-            (
-                *_formats("together", RUN_FORMATS),
-                Item(
-                    "report", "Report (PDF)", "Set-up, calibration, results, error budget, versions"
-                ),
-            ),
-        ),
-    )
+        ("Tables (CSV)", (
+            Item("tables:measures", "Measures", "One row per frame: width, length, height…"),
+            Item("tables:dots", "Dots", "One row per dot: its place, row, column and ray"),
+            Item("tables:points", "Points", "One row per reflection point, with its residual"),
+            Item("tables:boundary", "Boundary", "The pool's boundary, point by point"),
+        )),
+        ("Surfaces, one file per frame", (
+            *_formats("surfaces", SURFACE_FORMATS),
+            Item("solid", "Also as solids", "Each surface as a watertight body, mesh formats only"),
+        )),
+        ("Pictures, film (MP4)", (
+            Item("pictures:frames", "Frames", "Each frame with its dots, rows and columns"),
+            Item("pictures:surfaces", "Surfaces",
+                "Each surface in 3-D, seen from where you choose"),
+            Item("pictures:trends", "Trends", "Width, length and height over time"),
+            Item("pictures:film", "Film", "The surface in 3-D over all frames, each at its time"),
+        )),
+        ("Everything together", (
+            *_formats("together", RUN_FORMATS),
+            Item("report", "Report (PDF)", "Set-up, calibration, results, error budget, versions"),
+        )),
+    )  # fmt: skip
 
 
 def _formats(kind: str, formats: Mapping[str, SurfaceFormat | RunFormat]) -> list[Item]:
