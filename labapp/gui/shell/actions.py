@@ -112,31 +112,15 @@ FRAMES = (
 
 STEP_ACTIONS = (
     *(
-        Action(
-            f"step_{step.key}",
-            step.title,
-            f"Ctrl+{number % 10}" if number <= 10 else "",
-            step.hint,
-            needs="session",
-        )
+        Action(f"step_{step.key}", step.title, f"Ctrl+{number % 10}" if number <= 10 else "",
+            step.hint, needs="session")
         for number, step in enumerate(STEPS, 1)
     ),
-    Action(
-        "next_step",
-        "&Next step",
-        "Ctrl+PgDown",
-        "Go on to the next step",
-        needs="session",
-        begins=True,
-    ),
-    Action(
-        "previous_step",
-        "&Previous step",
-        "Ctrl+PgUp",
-        "Go back to the step before",
-        needs="session",
-    ),
-)
+    Action("next_step", "&Next step", "Ctrl+PgDown",
+        "Go on to the next step", needs="session", begins=True),
+    Action("previous_step", "&Previous step", "Ctrl+PgUp",
+        "Go back to the step before", needs="session"),
+)  # fmt: skip
 
 VIEW = (
     Action("steps", "&Steps", "Ctrl+Shift+1",

@@ -430,31 +430,17 @@ def _release(lock: FileLock | None) -> None:
 
 
 SQLITE_ERRORS: Sequence[tuple[tuple[int, ...], str, str, str]] = (
-    (
-        (sqlite3.SQLITE_FULL,),
-        "disk",
-        "no space left",
-        "room on the disk; everything up to the last finished change is kept",
-    ),
-    (
-        (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED),
-        "session",
-        "in use by another program",
-        "to try again, or close it there",
-    ),
-    (
-        (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM),
-        "file",
-        "cannot be written",
-        "a file and a folder that can be written; or open the session read-only",
-    ),
-    (
-        (sqlite3.SQLITE_IOERR,),
-        "disk",
-        "cannot be read or written",
-        "a disk that works and has room; everything up to the last finished change is kept",
-    ),
-)
+    ((sqlite3.SQLITE_FULL,), "disk", "no space left",
+        "room on the disk; everything up to the last finished change is kept"),
+    ((sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED), "session", "in use by another program",
+        "to try again, or close it there"),
+    ((sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM),
+        "file", "cannot be written",
+        "a file and a folder that can be written; or open the session read-only"),
+    ((sqlite3.SQLITE_IOERR,), "disk", "cannot be read or written",
+        "a disk that works and has room; everything up to the last finished change is kept"),
+)  # fmt: skip
+"""Error codes; the field, the value and what would be right."""
 
 
 @contextmanager
