@@ -148,7 +148,6 @@ def _about(error: OSError) -> InputError:
 
 
 def _commands() -> frozenset[str]:
-    """Names of the commands."""
     group = typer.main.get_command(app)
     assert isinstance(group, typer.core.TyperGroup)
     return frozenset(group.commands)

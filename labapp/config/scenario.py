@@ -238,7 +238,6 @@ def _view(path: Path, calibration: dict[str, Any], camera: dict[str, Any]) -> Ca
 def _pools(
     path: Path, keys: dict[str, Any], times_s: FloatArray, seed: int, head_sign: int
 ) -> tuple[TruePool, ...]:
-    """The pool of every frame."""
     if keys["shape"] == "surface":
         surface = read_pool(
             path.parent / keys["file"],

@@ -88,7 +88,6 @@ def with_methods(
 
 
 def _choices(owner: type, field: str) -> tuple[str, ...]:
-    """Values that the type of a field allows."""
     return get_args(get_type_hints(owner)[field])
 
 

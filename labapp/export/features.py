@@ -184,8 +184,6 @@ class FeatureTable:
         write_file(path, content.getvalue())
 
     def _columns(self) -> dict[str, FloatArray]:
-        """Return the numeric columns of all welds."""
-
         def joined(of: str) -> FloatArray:
             return np.concatenate([getattr(one, of) for one in self.welds])
 

@@ -161,7 +161,6 @@ def _edits_in_order(context: typer.Context) -> list[tuple[str, str]]:
 
 
 def _label(frames: list[int], edits: list[tuple[str, str]]) -> str:
-    """Return the label of the change in the history."""
     message = ", ".join(f"{name.replace('_', '-')} {value}".rstrip() for name, value in edits)
     label = f"{frames_text(frames)}: {message or 'carried on'}"
     return label if len(label) <= LABEL_LENGTH else f"{label[: LABEL_LENGTH - 1]}…"

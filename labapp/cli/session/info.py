@@ -113,7 +113,6 @@ def _differences(value: Any, usual: Any) -> dict[str, Any]:
 
 
 def _text(facts: dict[str, Any]) -> list[str]:
-    """Format the facts as lines."""
     results = [f"{r['count']} {r['scheme']} by labapp {r['version']}" for r in facts["results"]]
     changes = facts["changes"]
     lines = [

@@ -310,7 +310,6 @@ def _plate(edge_mm: FloatArray, box: FloatArray, stretch: FloatArray) -> Any:
 
 
 def _between(one: str, other: str, share: float) -> str:
-    """Return a colour between two."""
     import pyvista
 
     ends = np.array([pyvista.Color(each).float_rgb for each in (one, other)])

@@ -222,7 +222,6 @@ class Live:
         self._begin(("figures", self.watch.next_frame, self.watch.measure, 0.0, 0.0))
 
     def _begin(self, work: _Work) -> None:
-        """Start a thread for a work."""
         name = f"live {work[0]}"
         worker = threading.Thread(target=self._work_on, args=work, name=name, daemon=True)
         self._workers.append(worker)

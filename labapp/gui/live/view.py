@@ -384,7 +384,6 @@ class LiveView(QObject):
 
     @property
     def _age_s(self) -> float:
-        """Age of the figures, s."""
         result = self._result
         return 0.0 if result is None else time.monotonic() - result.arrived_s
 

@@ -269,7 +269,6 @@ class MainWindow(QMainWindow):
             self.workspace.show_frame(found)
 
     def _show_file(self, step: str, path: Path | None, at_once: bool) -> None:
-        """Show a step, and pass a file to its page."""
         self.show_step(step)
         if path is not None and self.page is not None:
             self.page.take(path, at_once)

@@ -233,7 +233,6 @@ class DynamicsWindow(ToolWindow):
     # --- one mode, one event -------------------------------------------------------------------
 
     def _show_mode(self) -> None:
-        """Show the selected mode."""
         self._turn.stop()
         self._film = []
         row = self.modes.currentRow()
@@ -269,7 +268,6 @@ class DynamicsWindow(ToolWindow):
             self.begin(f"Film of mode {mode.name}", work, done)
 
     def _next_picture(self) -> None:
-        """Show the next picture of the film."""
         self._film = [*self._film[1:], *self._film[:1]]
         self.shape.show_png(self._film[0], "Film of the mode")
 

@@ -263,7 +263,6 @@ class StudyWindow(ToolWindow):
             self._look()
 
     def _show_part(self, part: list[RecordingStatus] | str) -> None:
-        """Show the progress, or a message."""
         if isinstance(part, str):
             self.workspace.notified.emit(part, False)
             return

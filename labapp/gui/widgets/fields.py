@@ -193,7 +193,6 @@ class NumberField(Field):
         self._emit_change()
 
     def _read(self, text: str) -> tuple[float | None, str]:
-        """Value of a text, and its problem."""
         shown = self._shown(self._value)
         kept = f"{shown} stays" if shown else "the field stays empty"
         if not text.strip():

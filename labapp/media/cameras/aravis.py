@@ -262,7 +262,6 @@ class GenicamCamera(Camera):
             arv.arv_stream_push_buffer(stream.handle, buffer)
 
     def _image(self, buffer: int) -> GreyImage:
-        """Copy the grey levels from a buffer."""
         arv, size = self._aravis.arv, c_size_t()
         place = arv.arv_buffer_get_data(buffer, byref(size))
         rows = arv.arv_buffer_get_image_height(buffer)

@@ -228,7 +228,6 @@ def _is_times(path: Path, shape: tuple[int, ...], count: int) -> None:
 
 
 def _times_of(count: int) -> str:
-    """Describe valid times."""
     return f"{count} increasing times, one for every frame, s"
 
 

@@ -293,7 +293,6 @@ def folder_pattern(folder: Path) -> Path:
 
 
 def _toml(value: Condition) -> str:
-    """Format a value as TOML."""
     whole = isinstance(value, float) and value.is_integer()
     return str(tomlkit.item(int(value) if whole else value).as_string())
 

@@ -110,7 +110,6 @@ def run_jobs(
 
 
 def _error_of(future: Future[None]) -> Exception | None:
-    """The exception that a task raised, or None."""
     if future.cancelled():
         raise InputError("Dask", "connection", "lost", f"{A_SCHEDULER}; then run again")
     error = future.exception()

@@ -181,7 +181,6 @@ class ExportPage(Page):
         )
 
     def _tick(self, on: bool) -> None:
-        """Tick everything, or nothing."""
         for box in self._boxes.values():
             with QSignalBlocker(box):
                 box.setChecked(on)

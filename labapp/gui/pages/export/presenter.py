@@ -283,7 +283,6 @@ def _files_of_lines(session: Session, surfaces: int) -> list[str]:
 
 
 def _files(request: ExportRequest, count: int, surfaces: int) -> list[str]:
-    """Return the files of a pattern of dots."""
     lines = [f"{name}.csv" for name in ("measures", "dots", "points", "boundary")]
     lines = [line for line in lines if line.removesuffix(".csv") in request.some("tables")]
     formats = request.some("surfaces")

@@ -356,7 +356,6 @@ class PlanePage(Page):
             self._store()
 
     def _show_residuals(self) -> None:
-        """Redraw the residual map."""
         for item in self._residuals:
             self.view.remove(item)
         self._residuals = []

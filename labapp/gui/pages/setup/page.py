@@ -127,7 +127,6 @@ class SetupPage(Page):
             self.table.setVisible(bool(bench.rows))
 
     def _show_kind(self, kind: str) -> None:
-        """Show the fields for a kind of pattern."""
         for _, entries in RIG:
             for entry in entries:
                 field, sigma = self.rig_fields[entry.key], presenter.sigma_entry(entry)

@@ -105,7 +105,6 @@ class TrendsPage(Page):
         self.plots.set_current(frame, None if self.shown is None else self.shown.places.get(frame))
 
     def _show_events(self, events: Mapping[str, tuple[Event, ...]]) -> None:
-        """Mark events in the curves."""
         self._events = events
         self.leave()
         if self.isVisible():
