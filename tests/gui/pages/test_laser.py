@@ -22,6 +22,7 @@ from labapp.gui.shell.steps import Mark, states
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tasks import DONE
 from labapp.gui.workspace import Workspace
+from labapp.session.record import LaserEntries
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT
 from tests.gui.hand import Hand
@@ -30,8 +31,8 @@ CROSS = ((13.676,), (18.561,), (7.874,))
 
 
 def test_cells_are_parsed_as_readings() -> None:
-    cells = {(0, 0): "13,7", (1, 0): " 13.6", (0, 1): "18.5", (1, 1): "", (0, 2): "x", (1, 2): "-1"}
-    readings = presenter.typed(cells, 10.0)
+    cells = ("13,7", "18.5", "x"), (" 13.6", "", "-1")
+    readings = presenter.typed(LaserEntries(cells, 10.0, 0.1, 0.05))
     assert readings.lengths_mm == ((13.7, 13.6), (18.5,), ())
     assert readings.wrong == (
         "l₃, reading 1: “x” is not a length",

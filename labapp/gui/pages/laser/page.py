@@ -8,7 +8,6 @@ from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import QHeaderView, QStackedWidget, QTableWidget, QTableWidgetItem, QWidget
 
-from labapp.core.calibration.laser_calibration import LaserCalibrationSettings
 from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.kept_picture import KeptPicture, load_picture
 from labapp.gui.pages.laser import presenter
@@ -84,14 +83,7 @@ class LaserPage(Page):
 
     def readings(self) -> Readings:
         """Readings in the table."""
-        entries = self.entries()
-        cells = {
-            (row, k): text for row, line in enumerate(entries.cells) for k, text in enumerate(line)
-        }
-        settings = LaserCalibrationSettings(
-            resolution_mm=entries.resolution_mm, fan_angle_sigma_deg=entries.fan_angle_sigma_deg
-        )
-        return presenter.typed(cells, entries.fan_angle_deg, settings)
+        return presenter.typed(self.entries())
 
     def entries(self) -> LaserEntries:
         """All that is entered: the cells of the table without empty rows at the end, the fields."""

@@ -84,25 +84,22 @@ def length_text(value_mm: float) -> str:
     return max(f"{value_mm:.2f}", f"{value_mm:g}", key=len)
 
 
-def typed(
-    cells: Mapping[tuple[int, int], str],
-    fan_angle_deg: float,
-    settings: LaserCalibrationSettings | None = None,
-) -> Readings:
-    """Readings in the cells of the table, (row, column) → text."""
+def typed(entries: LaserEntries) -> Readings:
+    """Readings in the entries of the page."""
     lengths: list[list[float]] = [[], [], []]
     wrong = []
-    for (row, column), text in sorted(cells.items()):
-        if not text.strip():
-            continue
-        value = length_mm(text)
-        if value is None:
-            wrong.append(f"{NAMES[column]}, reading {row + 1}: “{text.strip()}” is not a length")
-        else:
-            lengths[column].append(value)
+    for row, line in enumerate(entries.cells, 1):
+        for name, text, column in zip(NAMES, line, lengths, strict=True):
+            value = length_mm(text)
+            if value is not None:
+                column.append(value)
+            elif text.strip():
+                wrong.append(f"{name}, reading {row}: “{text.strip()}” is not a length")
     l1, l2, l3 = map(tuple, lengths)
-    known = settings or LaserCalibrationSettings()
-    return Readings((l1, l2, l3), fan_angle_deg, known, tuple(wrong))
+    settings = LaserCalibrationSettings(
+        resolution_mm=entries.resolution_mm, fan_angle_sigma_deg=entries.fan_angle_sigma_deg
+    )
+    return Readings((l1, l2, l3), entries.fan_angle_deg, settings, tuple(wrong))
 
 
 def kept(session: Session) -> Readings | None:
