@@ -11,7 +11,7 @@ import sqlite3
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Literal, Never
+from typing import Any, Literal, Never, get_args
 
 from labapp.core.pipeline import FrameCorrection, Settings
 from labapp.errors import InputError
@@ -64,13 +64,8 @@ CLASSES: dict[str, Any] = {
 }
 """Class of a document, by its kind."""
 
-PICTURED: tuple[Kind, ...] = (
-    "laser-entries",
-    "laser-calibration",
-    "plane-entries",
-    "plane-calibration",
-    "bench-entries",
-    "bench-check",
+PICTURED: tuple[Kind, ...] = tuple(
+    kind for kind in get_args(Kind) if kind.startswith(("laser", "plane", "bench"))
 )
 """Kinds of documents that may have pictures."""
 
