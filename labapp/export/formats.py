@@ -144,23 +144,15 @@ class RunFormat:
 
 
 SURFACE_FORMATS: dict[str, SurfaceFormat] = {
-    "csv": SurfaceFormat(
-        ".csv", "CSV", "x, y, z of a grid within the boundary, mm", "nodes", "tables:nodes_csv", 28
-    ),
+    "csv": SurfaceFormat(".csv", "CSV", "x, y, z of a grid within the boundary, mm",
+        "nodes", "tables:nodes_csv", 28),
     "stl": SurfaceFormat(".stl", "STL", "Triangles, binary, mm", "mesh", "meshes:stl", 50),
-    "stl-ascii": SurfaceFormat(
-        "_ascii.stl",
-        "STL as text",
-        "Triangles as text, for old programs, mm",
-        "mesh",
-        "meshes:stl_ascii",
-        247,
-    ),
-    "ply": SurfaceFormat(
-        ".ply", "PLY", "Triangles for mesh programs, mm", "mesh", "meshes:ply", 29
-    ),
+    "stl-ascii": SurfaceFormat("_ascii.stl", "STL as text",
+        "Triangles as text, for old programs, mm", "mesh", "meshes:stl_ascii", 247),
+    "ply": SurfaceFormat(".ply", "PLY", "Triangles for mesh programs, mm",
+        "mesh", "meshes:ply", 29),
     "vtp": SurfaceFormat(".vtp", "VTP", "Triangles for ParaView, mm", "mesh", "meshes:vtp", 64),
-}
+}  # fmt: skip
 """Formats by their names in ``--surfaces``."""
 
 RUN_FORMATS: dict[str, RunFormat] = {
