@@ -106,7 +106,9 @@ class LiveTrends(QWidget):
         below = QWidget()
         self._below = QBoxLayout(QBoxLayout.Direction.TopToBottom, below)
         self._below.setContentsMargins(8, 0, 8, 0)
-        self._parts = limits, others = self._limits(), self._others()
+        limits, others = self._limits(), FieldForm(self.last, self.unmeasured)
+        others.setMinimumWidth(others.minimumSizeHint().width())
+        self._parts = limits, others
         self._below.addLayout(limits, 3)
         self._below.addWidget(others, 2, Qt.AlignmentFlag.AlignTop)
         self._fields = scrolled(below)
@@ -128,11 +130,6 @@ class LiveTrends(QWidget):
             for end in (0, 1):
                 grid.addWidget(self.fields[name, end], row, 1 + end)
         return grid
-
-    def _others(self) -> FieldForm:
-        form = FieldForm(self.last, self.unmeasured)
-        form.setMinimumWidth(form.minimumSizeHint().width())
-        return form
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Place all fields side by side if they fit; on a low canvas show plots or fields."""

@@ -111,7 +111,8 @@ def shown(session: Session, frame: int, found: DetectedDots | None) -> DotsState
         why = damage if result is None or result.stale else result.measurement.reason
         return DotsState(frame, "corrected", correction, computed, result, why)
     by = session.settings.dots, session.settings.lattice
-    if result is not None and _automatic(result, by):
+    measured_by = result and (result.settings.dots, result.settings.lattice)
+    if result is not None and measured_by == by and result.measurement.correction is None:
         measurement = result.measurement
         start = start_correction(measurement)
         return DotsState(frame, "measured", start, computed, result, measurement.reason)
@@ -132,13 +133,6 @@ def _result(session: Session, frame: int) -> tuple[Result | None, str]:
         return session.result(frame), ""
     except InputError as error:
         return None, f"{error}; measure the frame again"
-
-
-def _automatic(result: Result, by: tuple[DotSettings, LatticeSettings]) -> bool:
-    """Whether a result contains the automatic detection with these settings."""
-    measurement = result.measurement
-    same = (result.settings.dots, result.settings.lattice) == by
-    return same and measurement.correction is None
 
 
 def detect(
