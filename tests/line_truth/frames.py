@@ -32,8 +32,9 @@ is added at points between them."""
 PLATE_MM = 60.0, 30.0, 30.0, 0.0
 """Width, head, rear and height of the solid metal around the pool, mm."""
 
-ACROSS = np.linspace(-2.5, 2.5, 11)
-"""Points across a line at which light is added, standard deviations."""
+HALF_WIDTH, LEAST_ACROSS, APART_PX = 2.5, 11, 1.5
+"""Half width of a line, standard deviations; least number of points across it at which light is
+added; and their largest distance, px: farther apart than the blur is wide, they are stripes."""
 
 
 @dataclass(frozen=True)
@@ -192,16 +193,16 @@ def _line_light(
     middle, size = image[:, 1], np.array([view.width_px, view.height_px])
     shows: BoolArray = seen.visible.reshape(form)[:, 1] & ~_gaps(points, look, rng)
     light = np.zeros((view.height_px, view.width_px))
-    weights = np.exp(-(ACROSS**2) / 2)
     for n in range(form[0]):
         left, right = (_filled(image[n, side] - middle[n]) for side in (0, 2))
-        for place, weight in zip(ACROSS / EDGE, weights / weights.sum(), strict=True):
+        across, weights = _points_across((right - left)[shows[n]])
+        for place, weight in zip(across / EDGE, weights, strict=True):
             # The parabola through the three rays across the line.
             off = place * (place - 1) / 2 * left + place * (place + 1) / 2 * right
             _add_light(light, middle[n] + off, shows[n], bright[n] * weight)
         if look.metal:
             shift = (on_metal[n, 2] - on_metal[n, 0]) / 2
-            for place, weight in zip(ACROSS / EDGE, weights / weights.sum(), strict=True):
+            for place, weight in zip(across / EDGE, weights, strict=True):
                 share = bright[n] * weight * look.metal
                 _add_light(light, on_metal[n, 1] + place * shift, plate[n, 1], share)
     sigma_px = look.sigma_mm * float(np.sqrt(abs(np.linalg.det(view.px_per_mm))))
@@ -213,6 +214,17 @@ def _line_light(
         if 1 <= number[n] <= pattern.count and (on := visible[n]).any()
     )
     return light, lines
+
+
+def _points_across(spread_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points across a line, standard deviations, and their shares of its light, each shape (m,).
+
+    ``spread_px``: from one traced edge of the line to the other, at its rays, shape (n, 2).
+    """
+    widest = float(np.linalg.norm(spread_px, axis=-1).max(initial=0.0)) * HALF_WIDTH / EDGE
+    across = np.linspace(-HALF_WIDTH, HALF_WIDTH, max(LEAST_ACROSS, 1 + int(widest / APART_PX)))
+    weights = np.exp(-(across**2) / 2)
+    return across, weights / weights.sum()
 
 
 def _add_light(light: FloatArray, image_px: FloatArray, shows: BoolArray, weight: float) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
 from labapp.simulation.camera import CameraView
-from labapp.simulation.pools import spherical_cap
+from labapp.simulation.pools import egg, spherical_cap
 from tests.line_truth.frames import LineLook, render_lines
 from tests.line_truth.runs import PHASES, penetration_run
 
@@ -39,6 +40,17 @@ def test_light_is_on_the_true_lines():
     v, u = np.nonzero(frame.light_px > 0.02 * frame.light_px.max())
     distance = np.linalg.norm(np.stack([u, v], axis=-1)[:, None] - line_px, axis=-1).min(axis=1)
     assert distance.max() < 4 * 0.25 * 3.75 + 1.0
+
+
+def test_light_of_a_widened_line_is_one_ridge():
+    """A small steep pool spreads its top line over more than ten times the blur."""
+    pool, look = egg(4.6, 1.5, 2.3, 0.22), LineLook(fringes=())
+    frame = render_lines(pool, RIG, VIEW, look, np.random.default_rng(0))
+    top = max(frame.lines, key=lambda one: one.number)
+    u, v = np.rint(top.image_px[np.argmin(top.image_px[:, 1])]).astype(int)
+    light = gaussian_filter(frame.light_px[:, u], look.light.blur_px)[max(v - 12, 0) : v + 12]
+    rises = np.diff(light) > 0
+    assert np.sum(rises[:-1] & ~rises[1:]) <= 1
 
 
 def test_frame_without_a_pool_is_dark():
