@@ -10,6 +10,9 @@ import pytest
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LinePattern, LineRig, line_directions
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
+from labapp.core.lines.data import line_data
+from labapp.core.lines.detection.find_lines import find_lines
+from labapp.core.lines.detection.numbering import number_lines
 from labapp.core.lines.fit import fit_lines
 from labapp.core.lines.frame import measure_lines
 from labapp.core.lines.model import LineData, LineModel
@@ -234,6 +237,17 @@ def test_frames_give_height_numbers_and_features(peak_mm: float, numbers: list[i
     assert abs(result.features.asymmetry) < 0.1
     plane = VIEW.to_plane(np.concatenate([one.image_px for one in frame.lines]))
     assert result.features.width_mm == pytest.approx(np.ptp(plane[:, 0]), rel=0.1)
+
+
+def test_ends_of_a_widened_line_are_on_the_edge_of_the_pool():
+    """The edge cuts the light of the top line of a small steep pool off obliquely."""
+    frame = rendered(egg(4.63, 1.5, 2.25, 0.214))
+    top = number_lines(find_lines(frame.image), 5).lines[-1]
+    true = max(frame.lines, key=lambda one: one.number).image_px[[0, -1]]
+    assert np.abs(top.ends_px - true[np.argsort(true[:, 0])]).max() < 2.0
+    sigma = line_data((top,), CALIBRATION).end_sigma_mm
+    narrow = line_data((replace(top, width_px=2.0),), CALIBRATION).end_sigma_mm
+    assert (sigma > 1.5 * narrow).all()
 
 
 @pytest.mark.slow

@@ -66,6 +66,25 @@ def test_bent_line_is_not_biased_inwards():
     assert line.width_px == pytest.approx(2.5, rel=0.15)
 
 
+@pytest.mark.parametrize("seed", [0, 2, 4])
+def test_wide_faint_line_is_found_in_one_piece(seed: int):
+    """As the top line of a small convex pool, which is wider than the others and has speckle."""
+    path = arc((130.0, 120.0), 80.0, 1.1)
+    grains = gaussian_filter(np.random.default_rng(seed).normal(size=SHAPE), 1.0)
+    light = drawn((path, 14.0), width=6.0, noise=0.0) - 20.0
+    frame = light * (1 + 0.25 * grains / grains.std())
+    frame += drawn((arc((130.0, 190.0), 70.0, 0.6), 50.0), width=2.2, seed=seed)
+    line = max(find_lines(frame), key=lambda one: one.length_px)
+    assert line.width_px == pytest.approx(6.0, rel=0.1)
+    assert np.abs(line.ends_px - path[[0, -1]]).max() < 2.6
+    assert np.abs(np.linalg.norm(line.image_px - [130.0, 120.0], axis=-1) - 80.0).mean() < 0.3
+
+
+def test_narrow_lines_side_by_side_are_no_wide_line():
+    frame = drawn(*((arc((130.0, 150.0 + k), 90.0, 0.7), 40.0) for k in (0.0, 8.0)))
+    assert sum(one.length_px > 90.0 for one in find_lines(frame)) == 2
+
+
 def test_sharp_turn_is_followed():
     """A line of a concave pool near its focus: straight legs joined with a radius of 10 px."""
     across = np.linspace(-40.0, 40.0, 4000)

@@ -18,8 +18,9 @@ SMOOTHED = 2 * np.sqrt(np.pi)
 SIGMA_FACTOR, FLOOR_PX = 1.3, 0.06
 """Ratio of the scatter of a ridge to that expected from speckle; and the least uncertainty, px."""
 
-END_SIGMA_PX = 1.0
-"""Standard uncertainty of a line's end along it, px."""
+END_SIGMA_PX, END_SHARE = 1.0, 0.25
+"""Standard uncertainty of a line's end along it, px, and the least as a share of the line's width:
+the edge of the pool cuts a wide line obliquely."""
 
 
 def line_data(lines: tuple[LightLine, ...], calibration: ImageCalibration) -> LineData:
@@ -54,7 +55,7 @@ def _ends(line: LightLine, calibration: ImageCalibration) -> tuple[FloatArray, F
     own = ~line.cut
     across = np.stack([-line.tangent[:, 1], line.tangent[:, 0]], axis=-1)[[0, -1]][own]
     place, _, scale = _on_plane(line.ends_px[own], across, calibration)
-    return place, END_SIGMA_PX * scale
+    return place, max(END_SIGMA_PX, END_SHARE * line.width_px) * scale
 
 
 def _on_plane(

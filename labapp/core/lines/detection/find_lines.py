@@ -67,6 +67,20 @@ GRAIN_COLUMNS = 3.3
 LEAST_SCALE_PX, MOST_SCALE_PX = 1.6, 4.0
 """Limits of the smoothing in the second pass, which is the measured width of the lines, px."""
 
+OBLIQUE_PX = 3.5
+"""The path of a wider line is extrapolated to its ends from where the oblique edge of the pool does
+not displace it, px."""
+
+COARSER, LEAST_WIDE = 2.0, 4.0
+"""Ratio of the scale of wide lines to that of the others, which break wide lines into pieces; and
+the length of the shortest chain of a wide line, in multiples of its scale."""
+
+WIDE, BENEATH = 1.33, 2.0
+"""Least spread of a wide line's smoothed light, in multiples of its scale. Its ridge, normalised by
+the scale to the power of 3/2 (T. Lindeberg, Int. J. Computer Vision 30 (1998) 117-154), is also
+stronger than those of the finer scale within this many coarser scales of it: it is not a group of
+narrow lines."""
+
 LEAST_PX = 7.0
 """Length of the shortest chain of ridge points and of the shortest line, px."""
 
@@ -140,10 +154,19 @@ def find_lines(frame: Image) -> tuple[LightLine, ...]:
     width = float(np.sqrt(max(np.median(ratio) - SCALE_PX**2, 0.0)))
     scale = float(np.clip(width, LEAST_SCALE_PX, MOST_SCALE_PX))
     ridges = find_ridges(frame, scale)
-    joined = join_chains(ridges, _long_chains(ridges), scale)
+    long = _long_chains(ridges)
+    coarse = find_ridges(frame, COARSER * scale)
+    wide = _wide_chains(coarse, ridges, long, COARSER * scale)
     picture = np.ascontiguousarray(frame, np.float32)
     picture = picture - glow(picture)
-    found = (_line(picture, ridges, one, scale) for one in joined)
+    found = [
+        _line(picture, of, points, at)
+        for of, chosen, at in (
+            (ridges, _outside(ridges, long, coarse, wide, COARSER * scale), scale),
+            (coarse, wide, COARSER * scale),
+        )
+        for points in join_chains(of, chosen, at)
+    ]
     lines = tuple(one for one in found if one is not None)
     if _is_gathered(lines):
         return _spots(picture, lines)
@@ -229,6 +252,50 @@ def _long_chains(ridges: Ridges) -> IntArray:
     return np.flatnonzero(np.diff(ridges.starts) >= LEAST_PX)
 
 
+# --- wide lines -----------------------------------------------------------------------------------
+
+
+def _wide_chains(coarse: Ridges, fine: Ridges, long: IntArray, scale: float) -> IntArray:
+    """Indices of the coarse chains that are wide lines, and not a group of narrow ones."""
+    place, strength = (_of_chains(fine, each, long) for each in (fine.image_px, fine.strength))
+    wide = []
+    for k in np.flatnonzero(np.diff(coarse.starts) >= LEAST_WIDE * scale):
+        points = np.arange(*coarse.starts[k : k + 2])
+        near = _distance(place, coarse.image_px[points]) < BENEATH * scale
+        least = float(np.median(strength[near])) if near.any() else 0.0
+        is_stronger = COARSER**1.5 * np.median(coarse.strength[points]) > least
+        if is_stronger and spread_of(coarse, points) > WIDE * scale:
+            wide.append(k)
+    return np.array(wide, np.int64)
+
+
+def _outside(
+    fine: Ridges, long: IntArray, coarse: Ridges, wide: IntArray, scale: float
+) -> IntArray:
+    """Indices of the long fine chains that are not pieces of wide lines."""
+    place = _of_chains(coarse, coarse.image_px, wide)
+    if not len(place):
+        return long
+    beneath = [
+        np.median(_distance(fine.image_px[slice(*fine.starts[k : k + 2])], place)) < BENEATH * scale
+        for k in long
+    ]
+    return np.asarray(long[~np.array(beneath, bool)], np.int64)
+
+
+def _of_chains(ridges: Ridges, values: FloatArray, chosen: IntArray) -> FloatArray:
+    """Values of the points of some chains."""
+    parts = [values[slice(*ridges.starts[k : k + 2])] for k in chosen]
+    return np.concatenate([values[:0], *parts])
+
+
+def _distance(place: FloatArray, others: FloatArray) -> FloatArray:
+    """Distance of points, shape (n, 2), from the nearest of others, shape (m, 2), shape (n,)."""
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(others).query(place)[0], np.float64)
+
+
 # --- a line ---------------------------------------------------------------------------------------
 
 
@@ -265,16 +332,17 @@ def _line(picture: Grey, ridges: Ridges, points: IntArray, scale: float) -> Ligh
         window = np.clip(BEND_SHARE * radius, LEAST_WINDOW_PX, WIDER * smooth_px)
     light = float(np.median(strength) * spread2**1.5 * np.sqrt(2 * np.pi))
     near, heights = round(END_PX), ridges.height[points]
-    ends = [
-        _end(ridges.smooth, path, end, float(np.median(height)))
-        for end, height in ((0, heights[:near]), (-1, heights[-near:]))
-    ]
+    tips = float(np.median(heights[:near])), float(np.median(heights[-near:]))
+    places = _ends(ridges.smooth, path, tips)
     size = np.array(picture.shape[::-1])
-    places = np.array(ends)
     # Near an end that the pool's edge cuts obliquely, the light is not symmetric about the line.
     away = np.linalg.norm(path.place[:, None] - places, axis=-1).min(axis=-1)
     clear = seen & (away > END_WIDTHS * np.sqrt(spread2))
-    seen = clear if clear.sum() >= least else seen
+    if clear.sum() >= least:
+        seen = clear
+        if width > OBLIQUE_PX:
+            first, *_, last = np.flatnonzero(clear).tolist()
+            places = _ends(ridges.smooth, path.part(first, last + 1), tips)
     edge = max(EDGE_PX, STRIP_WIDTHS * width)
     cut = ((places < edge) | (places > size - 1 - edge)).any(axis=-1)
     return LightLine(
@@ -333,6 +401,11 @@ def _centers(
     scatter = 1.5 * (moment - (bell @ moment / total) * weight)
     variance = GRAIN_COLUMNS * (bell**2 @ scatter**2) / total**2
     return off, float(np.sqrt(np.median(variance[path.seen])))
+
+
+def _ends(smooth: Grey, path: SmoothPath, heights: tuple[float, float]) -> FloatArray:
+    """Positions beyond both ends of a path where the light falls to half, shape (2, 2), px."""
+    return np.array([_end(smooth, path, end, heights[end]) for end in (0, -1)])
 
 
 def _end(smooth: Grey, path: SmoothPath, end: int, height: float) -> FloatArray:

@@ -51,6 +51,11 @@ class SmoothPath(ReadOnlyArrays):
         turn = slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]
         return cls(place, slope / speed[:, None], turn / speed**3, seen)
 
+    def part(self, first: int, last: int) -> SmoothPath:
+        """Return the samples from one to before another."""
+        on = slice(first, last)
+        return SmoothPath(self.place[on], self.tangent[on], self.curvature[on], self.seen[on])
+
     @property
     def across(self) -> FloatArray:
         """Unit vector across the path, to the right of ``tangent`` in the image, shape (n, 2)."""
