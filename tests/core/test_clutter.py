@@ -23,10 +23,12 @@ from labapp.core.matching.hypothesis import (
     shifted_by,
 )
 from labapp.core.matching.observation import Observation
+from labapp.core.pipeline import Settings, measure
 from labapp.core.values import CannotMeasure
 from tests.benchmarks import clutter_recordings, rendered
 from tests.benchmarks.clutter import as_entered, draw, with_setup_errors
 from tests.benchmarks.dips import PoolResult, measure_pool
+from tests.benchmarks.faults import spoiled_frame
 from tests.core.test_dips import true_labels
 from tests.scenes import BENCH_VIEW, FRAME_SHAPE, SeenDots, as_dots
 
@@ -281,6 +283,13 @@ z_axis_mm = 31.75
 
 
 @pytest.mark.slow
+def test_rows_as_likely_without_the_dot_in_their_hole_are_a_rival() -> None:
+    """A false dot is in the hole, and another dot is missing: all rows had been one off."""
+    image, _, bench, _ = spoiled_frame("filled-hole", "concave", 6500)
+    result, _ = measure(image, bench, Settings())
+    assert result.status == "ambiguous-rows"
+
+
 @pytest.mark.parametrize("seed", [14, 33, 406])
 def test_rows_ambiguous_because_of_a_second_hole_are_rejected(seed: int) -> None:
     """Dots beside the marker are missing; in 406 a false dot lies on it: once a row off."""

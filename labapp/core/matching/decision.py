@@ -373,9 +373,9 @@ def _clearly_cheaper(
     With fine knots it must be far ahead, or cost less with both kinds of knots, and by the margin
     with one of them, unless the usual knots can follow its surface: where rows cross in a narrow
     dip, wrong rows cost less if they cannot. As the dot at the marker may be false, another
-    hypothesis that costs less without the marker is a rival.
+    hypothesis that does not cost more by half the margin without it is a rival.
     """
-    if other.cost_without_marker < best.cost_without_marker:
+    if other.cost_without_marker < best.cost_without_marker + settings.margin / 2:
         return False
     # With a wrong set-up and many false dots, wrong rows led by more than one margin.
     many_false = best.stray_count > settings.most_strays(best.label_count + best.stray_count)
