@@ -92,6 +92,20 @@ def test_false_dots_beyond_a_row_get_no_ray(monkeypatch: pytest.MonkeyPatch) -> 
     assert (repair.with_rim(observed, best).labels == labels).all()
 
 
+def test_ray_of_a_doubtful_label_is_not_dark_beside_a_continued_rim() -> None:
+    pool = Pool(Footprint(5.8, 3.2, 3.5), 0.2, fullness=0.8)
+    seen = see(pool, np.random.default_rng(1), sigma_px=0.05)
+    observed, labels = Observation.of(seen.dots, BENCH, FRAME_SHAPE), true_labels(seen)
+    best = evaluate(observed, without_ends(labels, rows=4))
+    assert best is not None
+    wider = repair.with_rim(observed, best)
+    assert (wider.labels == labels).all()
+    ray = tuple(np.argwhere(wider.ray_states < 0)[0])
+    states = best.ray_states.copy()
+    states[ray] = 0
+    assert repair.with_rim(observed, replace(best, ray_states=states)).ray_states[ray] == 0
+
+
 def test_rows_are_continued_over_several_dots() -> None:
     pool = Pool(Footprint(5.8, 3.2, 3.5), 0.2, fullness=0.85)
     seen = see(pool, np.random.default_rng(1), sigma_px=0.05)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -220,7 +221,9 @@ def with_rim(observed: Observation, best: Hypothesis) -> Hypothesis:
     if own is None or wider is None:
         return best
     if wider.cost <= own.cost + 2 * evidence:
-        return wider
+        # A ray that lost its label as doubtful is not known to be dark.
+        unknown = (best.ray_states == 0) & (labels == UNLABELLED)
+        return replace(wider, ray_states=np.where(unknown, 0, wider.ray_states))
     if wider.misfit < own.misfit:
         refuse_rim_left_out()
     return best
