@@ -15,14 +15,9 @@ from labapp.core.matching import match_rays
 from labapp.core.matching.checks import unexplained
 from labapp.core.matching.decision import with_rivals
 from labapp.core.matching.free_setup import with_setup_free
-from labapp.core.matching.hypothesis import (
-    FINE_FIT,
-    evaluate,
-    evaluate_averaged,
-    reoriented_labels,
-    shifted_by,
-)
+from labapp.core.matching.hypothesis import FINE_FIT, evaluate, evaluate_averaged
 from labapp.core.matching.observation import Observation
+from labapp.core.matching.relabelling import reoriented_labels, shifted_by
 from labapp.core.pipeline import Settings, measure
 from labapp.core.values import CannotMeasure
 from tests.benchmarks import clutter_recordings, rendered

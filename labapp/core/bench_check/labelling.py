@@ -23,8 +23,8 @@ from labapp.core.geometry.perturbation import moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import QUANTITIES
 from labapp.core.images.dots import Dots
-from labapp.core.matching.hypothesis import labels_from_lattice
 from labapp.core.matching.observation import UNLABELLED, Observation
+from labapp.core.matching.relabelling import labels_from_lattice
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import empty_sites, number_on_plane
 from labapp.core.values import CannotMeasure, FloatArray, IntArray

@@ -16,16 +16,11 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import Match, Orientation, signs_of
 from labapp.core.matching.checks.unexplained import is_scattered
-from labapp.core.matching.hypothesis import (
-    WIDE_FIT,
-    Hypothesis,
-    evaluate,
-    grow_and_evaluate,
-    labels_from_lattice,
-)
+from labapp.core.matching.hypothesis import WIDE_FIT, Hypothesis, evaluate, grow_and_evaluate
 from labapp.core.matching.match_rays import lattice_of_match, match_of_hypothesis, match_rays
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import LEAST_LABELS, UNLABELLED, Observation
+from labapp.core.matching.relabelling import labels_from_lattice
 from labapp.core.rows.lattice import Lattice, Site
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, IntArray

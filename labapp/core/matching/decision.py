@@ -33,9 +33,7 @@ from labapp.core.matching.hypothesis import (
     grow_and_evaluate,
     orientation_of,
     paths_of,
-    reoriented_labels,
     rough_costs,
-    shifted_labels,
     without_doubtful_outermost,
     without_false_ends,
 )
@@ -43,6 +41,7 @@ from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
+from labapp.core.matching.relabelling import exchanged_labels, reoriented_labels, shifted_labels
 from labapp.core.matching.repair import with_rim
 from labapp.core.surface.level import KnownRays
 from labapp.core.surface.pool_fit import FitSettings
@@ -119,11 +118,12 @@ def decide(
     _refuse_marker(observed, best, found)
     doubtful: list[int] = []
     rivals: list[tuple[IntArray, float]] = []
-    others = (
+    mirrored = (
         reoriented_labels(observed, best.labels, orientation, other)
         for other in settings.orientations
         if other != orientation
     )
+    others = (*mirrored, *exchanged_labels(observed, best.labels))
     for other in [*found, *neighbours, *_rivals(observed, best, others, fit_settings)]:
         if _clearly_cheaper(observed, cheapest, other, fit_settings, settings):
             continue

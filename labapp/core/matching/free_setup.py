@@ -21,7 +21,6 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.match import MatchedDots
 from labapp.core.matching.hypothesis import (
     MISSED_COST,
-    SHIFTS,
     STRAY_COST,
     USUAL_FIT,
     Hypothesis,
@@ -29,10 +28,10 @@ from labapp.core.matching.hypothesis import (
     evaluate_averaged,
     grow_and_evaluate,
     roughness_weight,
-    shifted_by,
     variance_mm2,
 )
 from labapp.core.matching.observation import UNLABELLED, Observation, amid, try_fit
+from labapp.core.matching.relabelling import SHIFTS, shifted_by
 from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.surface.setup_uncertainty import fit_changes, perturbed
 from labapp.core.values import FloatArray, IntArray

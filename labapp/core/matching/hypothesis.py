@@ -7,14 +7,12 @@ of the surface.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Literal
 
 import numpy as np
 
-from labapp.core.match import Orientation, signs_of
+from labapp.core.match import Orientation
 from labapp.core.matching.label_growth import grow_labels
 from labapp.core.matching.observation import (
     UNLABELLED,
@@ -33,7 +31,6 @@ from labapp.core.matching.prediction import (
     predict,
 )
 from labapp.core.matching.ray_classes import RayClasses, classify_rays
-from labapp.core.rows.lattice import Lattice, Site
 from labapp.core.surface.level import Level
 from labapp.core.surface.pool_fit import (
     CORRELATED_MM2,
@@ -78,15 +75,8 @@ MARKER_SPACINGS = 1 / 3
 """The marker is lit if a dot is nearer than this fraction of the distance to the nearest
 prediction."""
 
-SHIFTS = tuple((i, j) for i, j in product(range(-2, 3), repeat=2) if 0 < abs(i) + abs(j) < 3)
-"""Rows and columns by which labels are shifted."""
-
 MOST_KEPT = 50
 """Number of evaluated hypotheses of a frame that are kept: their surfaces have some 20 MB."""
-
-AGREED = 0.8
-"""Minimum share of the dots of a hypothesis in the lattice that must have the same offset of rays
-from sites."""
 
 
 @dataclass(frozen=True)
@@ -410,72 +400,3 @@ def _alone_around(lit: BoolArray, ray: list[int]) -> list[tuple[int, int]]:
     row = [(i, int(side[0])) for side in across if len(side) == 1 and min(map(len, across))]
     column = [(int(side[0]), j) for side in along if len(side) == 1 and min(map(len, along))]
     return row + column
-
-
-def labels_from_lattice(
-    lattice: Lattice, hole: Site, ray: Site, orientation: Orientation, shape: tuple[int, int]
-) -> IntArray:
-    """Label a complete lattice, given the site (k, t) of the hole and its absent ray (i, j).
-
-    Labels have the pattern's shape (rows, columns); dots at sites beyond it get no ray.
-    """
-    dot = np.nonzero(lattice.row > 0)[0]
-    site = np.stack([lattice.row[dot], lattice.column[dot]], axis=-1)
-    return _labels_of_pairs(np.array(ray) + (site - hole) * signs_of(orientation), dot, shape)
-
-
-def extended_over_lattice(
-    hypothesis: Hypothesis, lattice: Lattice, orientation: Orientation
-) -> IntArray | None:
-    """Extend the labels of a hypothesis over the lattice; None if the two disagree."""
-    labels = hypothesis.labels
-    at = np.argwhere(labels != UNLABELLED)
-    dot = labels[at[:, 0], at[:, 1]]
-    site = np.stack([lattice.row, lattice.column], axis=-1)
-    indexed = site[dot, 0] > 0
-    offset = (at + 1 - site[dot] * signs_of(orientation))[indexed]
-    if len(offset) == 0:
-        return None
-    kinds, count = np.unique(offset, axis=0, return_counts=True)
-    if count.max() < AGREED * len(offset):
-        return None
-    on_lattice = np.nonzero(site[:, 0] > 0)[0]
-    ray = site[on_lattice] * signs_of(orientation) + kinds[np.argmax(count)]
-    sited = _labels_of_pairs(ray, on_lattice, labels.shape)
-    others = np.where(np.isin(labels, on_lattice), UNLABELLED, labels)
-    return np.where(sited != UNLABELLED, sited, others)
-
-
-def shifted_labels(observed: Observation, labels: IntArray) -> Iterator[IntArray]:
-    """Yield labels shifted by up to two rows or columns.
-
-    A shift changes the surface slightly and hardly affects the residuals. It is what a single frame
-    determines least well.
-    """
-    for step in SHIFTS:
-        yield shifted_by(observed, labels, step)
-
-
-def shifted_by(observed: Observation, labels: IntArray, step: tuple[int, ...]) -> IntArray:
-    """Shift labels by rows and columns."""
-    at = np.argwhere(labels != UNLABELLED)
-    shifted = _labels_of_pairs(at + 1 + step, labels[tuple(at.T)], labels.shape)
-    shifted[observed.rays.absent] = UNLABELLED
-    return shifted
-
-
-def reoriented_labels(
-    observed: Observation, labels: IntArray, before: Orientation, after: Orientation
-) -> IntArray:
-    """Label the same dots with another orientation: rays are mirrored about the marker."""
-    at = np.argwhere(labels != UNLABELLED)
-    center = np.array(observed.rig.pattern.marker or observed.rig.pattern.center_ray)
-    ray = center + (at + 1 - center) * signs_of(before) * signs_of(after)
-    return _labels_of_pairs(ray, labels[at[:, 0], at[:, 1]], labels.shape)
-
-
-def _labels_of_pairs(ray: IntArray, dot: IntArray, shape: tuple[int, ...]) -> IntArray:
-    there = ((ray >= 1) & (ray <= shape)).all(axis=-1)
-    labels = np.full(shape, UNLABELLED, np.int64)
-    labels[ray[there, 0] - 1, ray[there, 1] - 1] = dot[there]
-    return labels

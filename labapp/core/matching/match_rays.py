@@ -64,11 +64,8 @@ from labapp.core.matching.hypothesis import (
     USUAL_FIT,
     Hypothesis,
     evaluate,
-    extended_over_lattice,
     grow_and_evaluate,
-    labels_from_lattice,
     paths_of,
-    reoriented_labels,
 )
 from labapp.core.matching.initial.caps import search_caps
 from labapp.core.matching.initial.quadrics import search_quadrics
@@ -81,6 +78,11 @@ from labapp.core.matching.observation import (
 )
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import certain_states
+from labapp.core.matching.relabelling import (
+    extended_over_lattice,
+    labels_from_lattice,
+    reoriented_labels,
+)
 from labapp.core.matching.repair import with_repaired, with_rows_beyond
 from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_dots
 from labapp.core.surface.solver import inverse_of
@@ -397,7 +399,9 @@ def _by_quadrics(
             continue
         found.append(hypothesis)
         if lattice is not None:
-            labels = extended_over_lattice(hypothesis, lattice, hypothesis.orientation(observed))
+            labels = extended_over_lattice(
+                hypothesis.labels, lattice, hypothesis.orientation(observed)
+            )
             wider = None if labels is None else grow_and_evaluate(observed, labels)
             found += [wider] if wider is not None else []
         if suffices(observed, hypothesis):
