@@ -16,6 +16,10 @@ OUT_OF_VIEW_SIGMA, LEAST_LINE = 2.5, 3
 dots are predicted in view by less than `OUT_OF_VIEW_SIGMA` σ. Its rays then are not known to be
 dark."""
 
+EXTRAPOLATED_MM = 1.0
+"""Predictions of dots are extrapolated if their standard uncertainty is larger: beside labelled
+dots it is 0.1 to 0.3 mm, beyond the last visible row of a pool that is steep there 2 to 3 mm."""
+
 NEAR_EDGE_MM = 8.0
 """Dots predicted within this distance of the edge of the view may be out of it. The uncertainty of
 predictions is computed only there."""
@@ -88,12 +92,17 @@ def certain_states(
     lit, certain = ray_states > 0, ray_states.copy()
     labelled = paths.plane_mm[lit.ravel()]
     view = observed.view_with(labelled[np.isfinite(labelled[:, 0])])
-    rim = np.flatnonzero((certain < 0) & widened(lit, 1))
+    known = np.isfinite(paths.plane_mm[:, 0]).reshape(lit.shape)
+    rim = np.flatnonzero(known & (certain <= 0) & widened(lit, 1))
     near = rim[~observed.in_view(paths.plane_mm[rim], NEAR_EDGE_MM, view)]
     if _in_lines(near, ray_states.shape[1]).any():
-        margin = OUT_OF_VIEW_SIGMA * np.sqrt(covariance_of(near)[:, [0, 1], [0, 1]])
-        near = near[~observed.in_view(paths.plane_mm[near], margin, view)]
-        certain.flat[near[_in_lines(near, ray_states.shape[1])]] = 0
+        sigma_mm = np.sqrt(covariance_of(near)[:, [0, 1], [0, 1]])
+        margin = OUT_OF_VIEW_SIGMA * sigma_mm
+        beyond = ~observed.in_view(paths.plane_mm[near], margin, view)
+        dark, rough = certain.flat[near] < 0, sigma_mm.max(axis=1) > EXTRAPOLATED_MM
+        # In an extrapolated row, those that are predicted out of view count as well.
+        for some in (beyond & dark, beyond & rough):
+            certain.flat[near[some][_in_lines(near[some], ray_states.shape[1])]] = 0
     return certain
 
 
