@@ -203,3 +203,31 @@ def test_merged_dots_of_a_row_beyond_the_labels_are_not_stray() -> None:
     # Two rows are left over: the dots of the second one may come from elsewhere.
     labels[last - 1] = UNLABELLED
     assert set(classify_rays(merging, labels, paths).stray) >= set(dots.tolist())
+
+
+def test_wide_dot_is_merged_from_those_of_the_rays_beside_it(
+    frame: tuple[Observation, IntArray],
+) -> None:
+    observed, labels = frame
+    pool = try_fit(observed, labels, USUAL_FIT)
+    assert pool is not None
+    paths = paths_of(observed, pool)
+    ray = np.argwhere(inner(labels != UNLABELLED))[0]
+    pair = np.array([labels[tuple(ray)], labels[ray[0], ray[1] + 1]])
+    half_apart_mm = np.diff(observed.plane_mm[pair], axis=0)[0] / 2
+    plane_mm, size_mm = observed.plane_mm.copy(), np.full(len(observed.plane_mm), 0.4)
+    plane_mm[pair[0]] += half_apart_mm
+    plane_mm[pair[1]] = [1.0, 1.0]  # a false dot
+    others = np.where(np.isin(labels, pair), UNLABELLED, labels)
+    usual = replace(observed, plane_mm=plane_mm, size_mm=size_mm)
+    size_mm = size_mm.copy()
+    size_mm[pair[0]] = np.hypot(0.4, np.linalg.norm(half_apart_mm))
+    found = classify_rays(replace(usual, size_mm=size_mm), others, paths)
+    assert found.stray.tolist() == [pair[1]]
+    assert len(found.missed) == 0
+    found = classify_rays(usual, others, paths)
+    assert sorted(found.stray) == sorted(pair)
+    assert len(found.missed) == 2
+    # A false dot that is wide has no rays beside it.
+    size_mm[pair[1]] = size_mm[pair[0]]
+    assert classify_rays(replace(usual, size_mm=size_mm), others, paths).stray.tolist() == [pair[1]]

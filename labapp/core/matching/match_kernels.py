@@ -11,6 +11,7 @@ from labapp.core.surface.kernels.ray_kernels import behind_torch, stopped_by_far
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 _f1, _f2, _f3 = (types.Array(types.float64, n, "A", readonly=True) for n in (1, 2, 3))
+_dots = types.Tuple((_f2, _f1))  # type: ignore[no-untyped-call]
 _uncertain = types.Tuple((_f2, _f3))  # type: ignore[no-untyped-call]
 _i1, _i2 = (types.Array(types.int64, n, "A", readonly=True) for n in (1, 2))
 _mask = types.Array(types.boolean, 2, "A", readonly=True)
@@ -221,14 +222,31 @@ def sure_pairs(
     return sure, prediction[sure]
 
 
-@compiled(_i2, _mask, _surface, _paths, _f2, _f2, _view, _f1)
+@inner
+def _merged(
+    dots: IntArray, places: FloatArray, reach: FloatArray, rays: IntArray, shown: FloatArray
+) -> tuple[BoolArray, BoolArray]:
+    """Masks of the dots that are merged from those of at least two rays, and of all such rays.
+
+    ``dots`` and ``rays`` are candidates; the latter's dots are computed at ``shown``.
+    """
+    is_merged, is_part = np.zeros(len(dots), np.bool_), np.zeros(len(shown), np.bool_)
+    for n in range(len(dots)):
+        off = shown[rays] - places[dots[n]]
+        within = rays[np.sum(off * off, axis=1) < reach[dots[n]] ** 2]
+        if len(within) > 1:
+            is_merged[n], is_part[within] = True, True
+    return is_merged, is_part
+
+
+@compiled(_i2, _mask, _surface, _paths, _f2, _dots, _view, _f1)
 def classify_rays(
     labels: IntArray,
     without_dot: BoolArray,
     surface: tuple[FloatArray, FloatArray],
     paths: tuple[FloatArray, FloatArray, FloatArray],
     rays: FloatArray,
-    dots: FloatArray,
+    dots: tuple[FloatArray, FloatArray],
     view: tuple[FloatArray, FloatArray, FloatArray],
     limits: FloatArray,
 ) -> tuple[IntArray, IntArray, IntArray]:
@@ -245,8 +263,10 @@ def classify_rays(
     paths
         Reflection points of the rays, row by row, shape (R, 3), slopes of the surface there, shape
         (R, 2), and computed dots, shape (R, 2); NaN if unknown.
-    rays, dots
-        Directions of the rays, shape (R, 3), and observed dots, shape (d, 2), mm.
+    rays
+        Directions of the rays, shape (R, 3).
+    dots
+        Observed dots, shape (d, 2), mm, and `Observation.merged_reach_mm`, shape (d,).
     view
         Homography and limits of the view, the last three arguments of `within_view`.
     limits
@@ -259,20 +279,25 @@ def classify_rays(
         See `ray_classes.RayClasses`; the states have shape (R,).
     """
     (points, slopes, plane), (tip, resolution, near_edge) = paths, limits
+    places, merged_reach = dots
     is_lit = labels >= 0
     lit, amid_lit, dotless = is_lit.ravel(), amid(is_lit).ravel(), without_dot.ravel()
     known = np.flatnonzero(np.isfinite(plane[:, 0]))
     shown = plane[known]
-    unlabelled = np.ones(len(dots), np.bool_)
+    unlabelled = np.ones(len(places), np.bool_)
     for label in labels.ravel():
         if label >= 0:
             unlabelled[label] = False
     stray = np.flatnonzero(unlabelled)
-    candidates = dots[stray]
+    candidates = places[stray]
+    among = np.flatnonzero(amid_lit[known] & ~dotless[known])
+    unlit = among[~lit[known[among]]]
+    merged, in_merged = _merged(stray, places, merged_reach, unlit, shown)
     if len(stray):
         around = np.flatnonzero(widened(amid(is_lit), 1).ravel()[known] & ~dotless[known])
         around = around[next_apart(shown[around]) < resolution]
-        stray = stray[two_nearest(candidates, shown[around])[0][:, 0] > resolution]
+        apart = two_nearest(candidates, shown[around])[0][:, 0]
+        stray = stray[(apart > resolution) & ~merged]
 
     known_paths = points[known], rays[known], slopes[known]
     free = ~behind_torch(*known_paths, tip)
@@ -285,8 +310,7 @@ def classify_rays(
     free &= ~stopped_by_far_side(surface, *known_paths, lit[known], next_to_lit)
     seen = free & within_view(shown, np.zeros_like(shown), view[0], view[1], view[2])
 
-    among = np.flatnonzero(amid_lit[known] & ~dotless[known])
-    unlit = among[seen[among] & ~lit[known[among]]]
+    unlit = unlit[seen[unlit] & ~in_merged[unlit]]
     apart = two_nearest(shown[unlit], shown[among])[0][:, 1]
     missed = known[unlit[apart >= resolution]]
 

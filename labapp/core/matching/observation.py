@@ -41,6 +41,10 @@ RESOLVED_SIZES = 2.2
 """Dots nearer to each other than this multiple of their standard deviation are not resolved: two
 equal Gaussians have a single peak up to 2, and pixels and noise blur them further."""
 
+MERGED_SIZES, MERGED_REACH = 1.45, 1.3
+"""A dot wider than the usual one by the first factor may be merged from several. Two dots s apart
+give a width of √(σ² + s²/4); the places of their rays are sought at up to s/2 times the second."""
+
 KEPT_BYTES = 100_000_000
 """Limit for the factors of the cached fits of a frame, bytes, beside which the rest of a fit is
 small. That is over a thousand fits of a usual pool."""
@@ -104,6 +108,17 @@ class Observation(ReadOnlyArrays):
     def resolution_mm(self) -> float:
         """Distance below which two dots merge, mm."""
         return RESOLVED_SIZES * median(self.size_mm)
+
+    @cached_property
+    def merged_reach_mm(self) -> FloatArray:
+        """How far from each dot those of which it may be merged are, by its width, shape (n,), mm.
+
+        0 for dots of the usual width.
+        """
+        usual = median(self.size_mm)
+        half_apart = np.sqrt(np.maximum(self.size_mm**2 - usual**2, 0.0))
+        wide = self.size_mm > MERGED_SIZES * usual
+        return np.where(wide, MERGED_REACH * half_apart + usual / 2, 0.0)
 
     @cached_property
     def spacing_mm(self) -> FloatArray:

@@ -48,7 +48,8 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
     """Classify every ray, for labels of shape (rows, columns) and a surface fitted to them.
 
     Where the surface predicts that dots merge, neither a dot nor a ray counts as unexplained. This
-    includes the dots of rays next to labelled ones: a concave pool focuses its last rows. Nor does
+    includes the dots of rays next to labelled ones: a concave pool focuses its last rows. A wide
+    dot without a ray is merged from those of the rays that are predicted within its width. Nor does
     a ray that the far side of such a pool may stop. Only labelled dots prove that dots are visible
     outside the nominal plane: others may come from elsewhere.
     """
@@ -61,7 +62,7 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
         (paths.basis.grid, paths.coefficients),
         (paths.points_mm, paths.slopes, paths.plane_mm),
         observed.rays.directions.reshape(-1, 3),
-        observed.plane_mm,
+        (observed.plane_mm, observed.merged_reach_mm),
         view,
         np.array([observed.rig.electrode.height_mm, observed.resolution_mm, NEAR_EDGE_MM]),
     )
