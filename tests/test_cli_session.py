@@ -666,7 +666,7 @@ def test_correction_is_carried_on_while_it_fits(labapp: Run, measured: Path) -> 
     )
     assert code == 0, stderr
     assert "It replaces earlier corrections of frame 3\n" in stdout
-    assert "Carried on over 3 frames, up to before frame 5: no-dots" in stdout
+    assert "Carried on over 3 frames, stopped before frame 5: no-dots" in stdout
     assert "Corrected: frames 1 to 4 (" in stdout
     assert "4 frames, 4 with a surface" in stdout
     with open_read_only(measured) as session:

@@ -16,7 +16,6 @@ from typer.core import TyperCommand
 
 from labapp.cli.shared import SessionFile, frames_text, measure_frames, report_stale_results
 from labapp.errors import InputError
-from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Measurement
@@ -276,29 +275,13 @@ def _dot_at(correction: Correction, u_px: float, v_px: float) -> int:
 
 def _carried_on(session: Session, frame: int, correction: Correction) -> dict[int, Correction]:
     """Apply a correction to the frames after it while it fits, and report where it ends."""
-    from labapp.core.images.find_dots import find_dots
-    from labapp.core.rows.carry_on import carry_on
-    from labapp.core.values import CannotMeasure
+    from labapp.session.carrying_on import carried_on
 
-    carried: dict[int, Correction] = {}
-    settings = session.settings.dots
-    stopped = "the last frame"
-    last: Correction | None = correction
-    for number in session.frames[session.frames > frame].tolist():
-        assert last is not None
-        try:
-            last = carry_on(last, find_dots(session.frame(number).image, settings))
-            why = "it no longer fits"
-        except (CannotMeasure, InputError) as answer:
-            last, why = None, str(answer)
-        if last is None:
-            stopped = f"before frame {number}: {why}"
-            break
-        carried[number] = last
+    carried, words = carried_on(session, frame, correction)
     replaced = [number for number in carried if session.correction(number) is not None]
     if replaced:
         typer.echo(f"It replaces earlier corrections of {frames_text(replaced)}")
-    typer.echo(f"Carried on over {pluralize(len(carried), 'frame')}, up to {stopped}")
+    typer.echo(words)
     return carried
 
 

@@ -576,9 +576,9 @@ def test_cancelled_carrying_keeps_finished_frames(copy_sample: CopySample) -> No
             control.check()
 
         control.progress = progress  # type: ignore[method-assign]
-        carried = presenter.carry(session, presenter.shown(session, 2, None), None, control)
-        assert list(carried.corrections) == [3, 4]
-        assert "stopped before frame 5: it was cancelled" in carried.words
+        carried, words = presenter.carry(session, presenter.shown(session, 2, None), None, control)
+        assert list(carried) == [3, 4]
+        assert "stopped before frame 5: it was cancelled" in words
 
 
 def test_row_search_is_chosen_on_the_page(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from PySide6.QtCore import QObject, QTimer, Signal
 
+from labapp.core.rows.correction import Correction
 from labapp.errors import InputError
 from labapp.gui.pages.dots import presenter
-from labapp.gui.pages.dots.presenter import Carried, DetectedDots, DotsState
+from labapp.gui.pages.dots.presenter import DetectedDots, DotsState
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import recording_gone, why_not_measurable
 from labapp.gui.tasks import PROBLEM, Control, Task
@@ -108,20 +109,18 @@ def carry_on(page: Page, seen: DotsState, most: int | None, answer: Message) -> 
     """Propagate the correction of a frame to later frames, one step of undo; then measure."""
     workspace, session = page.workspace, page.session
 
-    def finished(carried: Carried) -> None:
-        if carried.corrections and not workspace.attempt(
-            lambda session: session.correct(
-                carried.corrections, f"carry frame {seen.frame} on over {len(carried.corrections)}"
-            )
-        ):
+    def finished(carried: tuple[dict[int, Correction], str]) -> None:
+        corrections, words = carried
+        if not corrections:
+            workspace.notified.emit(words, True)
+            answer.setText(f"{PROBLEM} {words}")
             return
-        if not carried.corrections:
-            workspace.notified.emit(carried.words, True)
-            answer.setText(f"{PROBLEM} {carried.words}")
+        label = f"carry frame {seen.frame} on over {len(corrections)}"
+        if not workspace.attempt(lambda session: session.correct(corrections, label)):
             return
-        page.confirm(carried.words, answer)
+        page.confirm(words, answer)
         if not why_not_measurable(session):
-            workspace.measure(list(carried.corrections), beside=page.answer.setText)
+            workspace.measure(list(corrections), beside=page.answer.setText)
 
     page.start_task(
         "Carrying on",

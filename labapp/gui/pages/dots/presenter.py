@@ -13,7 +13,6 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.pipeline import Measurement, Settings, start_correction
-from labapp.core.rows.carry_on import carry_on
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice, number_on_plane
@@ -21,6 +20,7 @@ from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
 from labapp.gui.tasks import Cancelled, Control
+from labapp.session.carrying_on import carried_on
 from labapp.session.results.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
 from labapp.text import SIGMA_OF, plain, pluralize
@@ -318,46 +318,22 @@ def compared(before: Figures | None, after: Figures | None, pending: str = "") -
 # --- following frames -------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Carried:
-    """Result of propagating a correction."""
-
-    corrections: dict[int, Correction]
-    """Frame → correction, without the initial frame."""
-    words: str
-    """Where and why it stopped, one sentence."""
-
-
-def carry(session: Session, seen: DotsState, most: int | None, control: Control) -> Carried:
-    """Propagate a frame's dots and rows to the following frames, as long as they fit.
+def carry(
+    session: Session, seen: DotsState, most: int | None, control: Control
+) -> tuple[dict[int, Correction], str]:
+    """Apply a frame's dots and rows to following frames, see `carried_on`.
 
     If the operator cancels, the corrections made so far are kept.
-
-    Parameters
-    ----------
-    seen
-        The initial frame.
-    most
-        Maximum number of frames; None: to the end.
     """
-    later = session.frames[session.frames > seen.frame].tolist()[:most]
-    settings, last = session.settings.dots, _confirmed(seen)
-    carried: dict[int, Correction] = {}
-    stopped = "there is no frame after it" if not later else f"up to frame {later[-1]}"
-    for done, number in enumerate(later):
+
+    def proceed(done: int, total: int) -> bool:
         try:
-            control.progress(done, len(later))
-            following = carry_on(last, find_dots(session.frame(number).image, settings))
-            why = "it no longer fits there"
+            control.progress(done, total)
         except Cancelled:
-            following, why = None, "it was cancelled"
-        except (CannotMeasure, InputError) as answer:
-            following, why = None, str(answer)
-        if following is None:
-            stopped = f"stopped before frame {number}: {why}"
-            break
-        carried[number] = last = following
-    return Carried(carried, f"Carried on over {pluralize(len(carried), 'frame')}, {stopped}")
+            return False
+        return True
+
+    return carried_on(session, seen.frame, _confirmed(seen), most, proceed)
 
 
 def _confirmed(seen: DotsState) -> Correction:
