@@ -12,9 +12,9 @@ from labapp.core.dynamics.oscillation import FEWEST
 from labapp.core.surface.measures import WITH_SIGMA
 from labapp.gui.curves import titled
 from labapp.gui.pages.trends.presenter import SIGNALS
-from labapp.session.results.trends import BY_KEY
+from labapp.session.results.trends import LABELS
 from labapp.studies.tables import Table
-from labapp.text import pluralize, with_sigma
+from labapp.text import pluralize, split_unit, with_sigma
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics
@@ -48,7 +48,7 @@ class Analysed:
         return {} if self.signals is None else self.signals.timed()
 
 
-SERIES = [(name, BY_KEY[name].label) for name in WITH_SIGMA]
+SERIES = [(name, LABELS[name]) for name in WITH_SIGMA]
 
 WIDE, HIGH, DPI = 4.9, 3.9, 120
 """Size of a picture, inches, and dots per inch: readable in a narrow window."""
@@ -204,7 +204,7 @@ def series_label(name: str) -> str:
     """Label of a series or signal with its unit."""
     if name in SIGNALS:
         return titled(*SIGNALS[name])
-    return titled(BY_KEY[name].label, BY_KEY[name].unit)
+    return titled(LABELS[name], split_unit(name)[1])
 
 
 # --- pictures ---------------------------------------------------------------------------------

@@ -10,8 +10,10 @@ import numpy as np
 import scipy
 
 from labapp.core.sequence.mean import setup_sigma_of_mean, sigma_of_mean
+from labapp.core.surface.measures import WITH_SIGMA, sigma_name
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.session.results.measured import Overview
+from labapp.text import split_unit
 
 NEIGHBOURS = 15
 """Number of frames in the running median with which a frame is compared."""
@@ -31,42 +33,22 @@ EVEN = 0.05
 """Largest relative difference of equal time steps."""
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """A measure that can be shown as a trend."""
-
-    key: str
-    """Name in `Measures`."""
-    label: str
-    unit: str
-    sigma: str = ""
-    """Name of its σ in `Measures`; empty if there is none."""
-
-
-QUANTITIES = (
-    Quantity("width_mm", "Width", "mm", "width_sigma_mm"),
-    Quantity("length_mm", "Length", "mm", "length_sigma_mm"),
-    Quantity("height_mm", "Height", "mm", "height_sigma_mm"),
-    Quantity("depth_mm", "Depth", "mm", "depth_sigma_mm"),
-    Quantity("area_mm2", "Area", "mm²", "area_sigma_mm2"),
-    Quantity("volume_mm3", "Volume", "mm³", "volume_sigma_mm3"),
-    Quantity("convexity_mm", "Convexity", "mm", "convexity_sigma_mm"),
-    Quantity("asymmetry", "Asymmetry", "", "asymmetry_sigma"),
-    Quantity("wetting_slope_deg", "Wetting slope", "°", "wetting_slope_sigma_deg"),
-    Quantity("are_mm", "ARE", "mm"),
-    Quantity("center_x_mm", "Centre X", "mm"),
-    Quantity("center_y_mm", "Centre Y", "mm"),
-    Quantity("peak_x_mm", "Peak X", "mm"),
-    Quantity("peak_y_mm", "Peak Y", "mm"),
-)
-BY_KEY = {quantity.key: quantity for quantity in QUANTITIES}
+LABELS = {name: split_unit(name)[0].capitalize() for name in WITH_SIGMA} | {
+    "are_mm": "ARE",
+    "center_x_mm": "Centre X",
+    "center_y_mm": "Centre Y",
+    "peak_x_mm": "Peak X",
+    "peak_y_mm": "Peak Y",
+}
+"""Measures that can be shown as trends, by their names in `Measures`, and their labels."""
 
 
 @dataclass(frozen=True)
 class Trend(ReadOnlyArrays):
     """A measure over the n frames that have it."""
 
-    quantity: Quantity
+    key: str
+    """The measure, one of `LABELS`."""
     frame: IntArray
     """Numbers of the frames, ascending, shape (n,)."""
     at: FloatArray
@@ -77,7 +59,7 @@ class Trend(ReadOnlyArrays):
     """Indices among the session's frames, ascending, shape (n,)."""
     value: FloatArray
     sigma: FloatArray
-    """Values and their σ, shape (n,), in the quantity's unit; σ is NaN if unknown."""
+    """Values and their σ, shape (n,), in the measure's unit; σ is NaN if unknown."""
     outlying: BoolArray
     stale: BoolArray
     corrected: BoolArray
@@ -86,6 +68,16 @@ class Trend(ReadOnlyArrays):
     """Which are included in the statistics and the spectrum, shape (n,)."""
     measures: Mapping[str, FloatArray]
     """All measures of these frames by name, each of shape (n,)."""
+
+    @property
+    def label(self) -> str:
+        """Label of the measure, without its unit."""
+        return LABELS[self.key]
+
+    @property
+    def unit(self) -> str:
+        """Unit of the measure; empty for a ratio."""
+        return split_unit(self.key)[1]
 
 
 @dataclass(frozen=True)
@@ -139,21 +131,20 @@ def trend(
     Parameters
     ----------
     key
-        Name of the measure, one of `BY_KEY`.
+        Name of the measure, one of `LABELS`.
     without_outlying
         Whether outlying frames are excluded from the statistics. Stale results always are.
     outlying
         Result of `outlying_frames`, if already known.
     """
-    quantity = BY_KEY[key]
     value = seen.measures[key]
     has = np.flatnonzero(np.isfinite(value))
     timed = bool(np.isfinite(seen.time_s).all())
     outlying = outlying_frames(seen) if outlying is None else outlying
     counts = ~seen.stale & ~(outlying & without_outlying)
-    sigma = seen.measures[quantity.sigma] if quantity.sigma else np.full(len(value), np.nan)
+    sigma = seen.measures.get(sigma_name(key), np.full(len(value), np.nan))
     return Trend(
-        quantity=quantity,
+        key=key,
         frame=seen.frame[has],
         at=(seen.time_s if timed else seen.frame.astype(float))[has],
         timed=timed,
@@ -197,15 +188,15 @@ def statistics_of(course: Trend) -> Statistics:
     value = course.value[course.counts]
     if not len(value):
         return Statistics(0, *(4 * (float("nan"),)))
-    key, counted = course.quantity.key, {k: v[course.counts] for k, v in course.measures.items()}
+    counted = {k: v[course.counts] for k, v in course.measures.items()}
     return Statistics(
         len(value),
         float(value.mean()),
         float(value.std()),
         float(value.min()),
         float(value.max()),
-        sigma_of_mean(key, counted),
-        setup_sigma_of_mean(key, counted),
+        sigma_of_mean(course.key, counted),
+        setup_sigma_of_mean(course.key, counted),
     )
 
 

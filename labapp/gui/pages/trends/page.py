@@ -22,7 +22,7 @@ from labapp.gui.widgets.labels import Message, heading, keep_room, wrapping_labe
 from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
-from labapp.session.results.trends import QUANTITIES
+from labapp.session.results.trends import LABELS
 from labapp.session.signals import Signals, read_signals
 from labapp.text import pluralize
 
@@ -226,8 +226,7 @@ class TrendsPage(Page):
     def _make_choice(self) -> QGridLayout:
         grid = QGridLayout()
         grid.setContentsMargins(0, 0, 0, 0)
-        names = {quantity.key: quantity.label for quantity in QUANTITIES}
-        names |= {key: name for key, (name, _) in SIGNALS.items()}
+        names = LABELS | {key: name for key, (name, _) in SIGNALS.items()}
         for number, (key, name) in enumerate(names.items()):
             box = QCheckBox(name)
             box.setToolTip(f"Show {name.lower() if name != 'ARE' else name} over the recording")
@@ -237,7 +236,7 @@ class TrendsPage(Page):
         return grid
 
     def _make_spectrum(self) -> None:
-        choices = [("", "none"), *((q.key, q.label) for q in QUANTITIES)]
+        choices = [("", "none"), *LABELS.items()]
         self.of = ChoiceField("Spectrum of", choices, tooltip="Shows oscillations of a measure")
         self.of.edited.connect(lambda key: self._set_options(spectrum_of=key))
         self.spectrum_words = Message(3)

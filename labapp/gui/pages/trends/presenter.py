@@ -22,7 +22,7 @@ from labapp.session.results.line_trends import (
 )
 from labapp.session.results.measured import Overview
 from labapp.session.results.trends import (
-    BY_KEY,
+    LABELS,
     Trend,
     outlying_frames,
     spectrum,
@@ -126,16 +126,12 @@ def show(
     def course_of(key: str) -> Trend:
         return trend(seen, key, options.without_doubtful, doubtful)
 
-    courses = [course_of(key) for key in BY_KEY if key in chosen]
+    courses = [course_of(key) for key in LABELS if key in chosen]
     timed, axis, places = _axis(seen)
-    curves = [
-        _curve(course, events.get(course.quantity.key, ()))
-        for course in courses
-        if len(course.frame)
-    ]
+    curves = [_curve(course, events.get(course.key, ())) for course in courses if len(course.frame)]
     if signals is not None and timed:
         curves += _signal_curves(signals, seen, chosen, events)
-    of = course_of(options.spectrum_of) if options.spectrum_of in BY_KEY else None
+    of = course_of(options.spectrum_of) if options.spectrum_of in LABELS else None
     found, spectrum_axis, message = _spectrum(of, timed)
     return TrendsState(
         curves=tuple(curves),
@@ -221,8 +217,8 @@ def _curve(course: Trend, events: Sequence[Event]) -> Curve:
     mark[course.outlying] = DOUBTFUL
     mark[course.stale] = STALE
     return Curve(
-        name=course.quantity.label,
-        unit=course.quantity.unit,
+        name=course.label,
+        unit=course.unit,
         x=course.at,
         y=course.value,
         sigma=course.sigma,
@@ -231,12 +227,12 @@ def _curve(course: Trend, events: Sequence[Event]) -> Curve:
         marks=MARKS,
         level=statistics_of(course).mean,
         events=np.array([one.time_s for one in events if course.timed]),
-        decimals=4 if course.quantity.key == "are_mm" else 3,
+        decimals=4 if course.key == "are_mm" else 3,
     )
 
 
 def _rows(course: Trend) -> tuple[ResultRow, ...]:
-    found, quantity = statistics_of(course), course.quantity
+    found = statistics_of(course)
     place, sure_place = (
         len(rounded(found.mean, sigma)[0].partition(".")[2])
         for sigma in (found.deviation, found.mean_sigma)
@@ -246,14 +242,14 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
     note = f"Mean and standard deviation (divided by n, Eq. 7-2 … 7-4) of {frames}"
     sure = (
         f"± of the mean, {SIGMA_OF}: frames with the same outline share the error of the level, "
-        f"all frames that of the set-up ({found.mean_setup_sigma:.2g} {quantity.unit})"
+        f"all frames that of the set-up ({found.mean_setup_sigma:.2g} {course.unit})"
     )
     unknown = None if not found.count else " … ".join(ends).replace("-", "−")
     return (
-        ResultRow(quantity.label, found.mean, found.deviation, quantity.unit, note=note),
-        ResultRow("range", unknown, unit=quantity.unit, note=f"Smallest and largest of {frames}"),
+        ResultRow(course.label, found.mean, found.deviation, course.unit, note=note),
+        ResultRow("range", unknown, unit=course.unit, note=f"Smallest and largest of {frames}"),
         *(
-            [ResultRow("± of the mean", found.mean_sigma, None, quantity.unit, sure_place, sure)]
+            [ResultRow("± of the mean", found.mean_sigma, None, course.unit, sure_place, sure)]
             if math.isfinite(found.mean_sigma)
             else []
         ),
@@ -276,7 +272,7 @@ def _counted(seen: Overview, course: Trend) -> str:
 
 def _without_shape(courses: Sequence[Trend]) -> str:
     """Text of the displayed measures that are missing in results of earlier versions."""
-    names = [one.quantity.label for one in courses if not len(one.frame)]
+    names = [one.label for one in courses if not len(one.frame)]
     if not names or all(not len(one.frame) for one in courses):
         return ""
     return f". {', '.join(names)}: not in results of an earlier version"
@@ -290,10 +286,9 @@ def _spectrum(course: Trend | None, timed: bool) -> tuple[tuple[Curve, ...], Axi
         found = spectrum(course)
     except ValueError as error:
         return (), axis, capitalized(str(error))
-    quantity = course.quantity
     curve = Curve(
-        f"Amplitude, {quantity.label.lower()}" if quantity.label != "ARE" else "Amplitude, ARE",
-        quantity.unit,
+        f"Amplitude, {course.label.lower()}" if course.label != "ARE" else "Amplitude, ARE",
+        course.unit,
         found.frequency,
         found.amplitude,
         decimals=4,
@@ -305,9 +300,7 @@ def _spectrum(course: Trend | None, timed: bool) -> tuple[tuple[Curve, ...], Axi
     if frequency == found.frequency[0]:  # one period in the series: perhaps a drift
         strongest = f"No oscillation stands out: the value changes mostly below {nearest}"
     else:
-        strongest = (
-            f"Strongest at {frequency:.{place}f} {axis.unit}: {amplitude:.2g} {quantity.unit}"
-        )
+        strongest = f"Strongest at {frequency:.{place}f} {axis.unit}: {amplitude:.2g} {course.unit}"
     return (
         (curve,),
         axis,
