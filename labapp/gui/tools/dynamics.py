@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics
     from labapp.export.dynamics import MeasuredSurface
     from labapp.gui.shell.files import Files
-    from labapp.session.results.measured import Overview
 
 FILM_MS = 80
 """Interval of the pictures in the film of a mode."""
@@ -125,13 +124,10 @@ class DynamicsWindow(ToolWindow):
         if not presenter.same_results(self._present(), self._of):
             self.start()
 
-    def _overview(self) -> Overview | None:
-        """Overview of the session; None without a session, and if it is damaged: reported."""
-        return self.workspace.run_or_report(self.workspace.overview)
-
     def _present(self) -> presenter.Analysed | None:
         """What would be analysed now; None without a session, and if it is damaged: reported."""
-        session, seen = self.workspace.session, self._overview()
+        session = self.workspace.session
+        seen = self.workspace.run_or_report(self.workspace.overview)
         if session is None or seen is None:
             return None
         return self.workspace.run_or_report(lambda: presenter.Analysed(seen, session.signals))

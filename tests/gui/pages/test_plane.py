@@ -19,6 +19,7 @@ from pytestqt.qtbot import QtBot
 from labapp.config.setup_text import lens_of
 from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.boards import BOARDS
+from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
@@ -175,7 +176,7 @@ def test_values_in_use_are_shown_for_either_form(tmp_path: Path) -> None:
 
 def test_picture_without_a_target_is_rejected() -> None:
     with pytest.raises(CannotMeasure, match="no dark marks"):
-        presenter.find([np.full((200, 300), 90, np.uint8)], 6.35, None)
+        calibrate_imaging_plane([np.full((200, 300), 90, np.uint8)], 6.35, None)
 
 
 # --- the page ---------------------------------------------------------------------------------
@@ -280,13 +281,13 @@ def test_only_one_search_runs_and_it_replaces_no_dragged_point(
     answer, release, begun = page.found, threading.Event(), threading.Semaphore(0)
     searches: list[object] = []
 
-    def slow(*given: object) -> object:
+    def slow(*given: object, lens: object) -> object:
         searches.append(given)
         begun.release()
         release.wait()
         return answer
 
-    monkeypatch.setattr(presenter, "find", slow)
+    monkeypatch.setattr("labapp.gui.pages.plane.page.calibrate_imaging_plane", slow)
     page.find_button.click()
     page.find_button.click()
     qtbot.waitUntil(lambda: begun.acquire(blocking=False))

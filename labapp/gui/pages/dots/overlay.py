@@ -37,6 +37,8 @@ increment for selected dots."""
 CROSS = 9.0
 """Width of a cross, points of the screen; less in a smaller ring."""
 
+NO_DOTS = Correction.of(None, None)
+
 DOT_WIDTHS = 6.0
 """Diameter of a ring in σ of a dot's light at high zoom, so that it surrounds the dot."""
 
@@ -46,8 +48,8 @@ class DotsOverlay:
 
     def __init__(self, view: PictureView) -> None:
         self._view = view
-        self._correction: Correction | None = None
-        self._joints: tuple[IntArray, ...] = ()
+        self._correction = NO_DOTS
+        self._joints = _joints(NO_DOTS)
         self._columns = _line("#ffffff", 70)
         self._rows = _line("#ffffff", 150)
         self._blocked = _line("#ffffff", 200, Qt.PenStyle.DashLine)
@@ -75,21 +77,25 @@ class DotsOverlay:
         computed_px: FloatArray,
     ) -> None:
         """Draw dots at positions, shape (n, 2), px: those of the correction unless dragged."""
+        correction = NO_DOTS if correction is None else correction
         if correction is not self._correction:
             self._correction = correction
             self._joints = _joints(correction)
             self._apart_px = _apart(dots_px)
         self._drawn = dots_px, selection
         self._size = self._ring()
-        self._draw_lines(dots_px)
-        self._draw_dots(correction, dots_px, selection)
+        for item, joints in zip(
+            (self._columns, self._rows, self._blocked), self._joints, strict=True
+        ):
+            item.setData(*dots_px[joints.ravel()].T, connect="pairs")
+        self._draw_dots()
         self._computed.setData(*computed_px.T, size=self._cross())
-        self._draw_labels(correction, dots_px)
-        self._draw_reference(correction)
+        self._draw_labels()
+        self._draw_reference()
 
     def _ring(self) -> float:
         """Diameter of a ring at the current zoom, points of the screen."""
-        if self._correction is None or not len(self._correction.dots):
+        if not len(self._correction.dots):
             return LEAST
         width = DOT_WIDTHS * float(np.median(self._correction.dots.size_px))
         least = float(np.clip(0.9 * self._apart_px / self._view.px_per_point, TINY, LEAST))
@@ -100,13 +106,12 @@ class DotsOverlay:
 
     def _rescale(self) -> None:
         """Adjust the rings to another zoom."""
-        correction, (dots_px, selection) = self._correction, self._drawn
         if self._ring() != self._size:
             self._size = self._ring()
-            self._draw_dots(correction, dots_px, selection)
-            self._draw_reference(correction)
+            self._draw_dots()
+            self._draw_reference()
             self._computed.setSize(self._cross())
-        self._draw_labels(correction, dots_px)
+        self._draw_labels()
 
     def toggle(self) -> None:
         """Hide all marks, or show them again."""
@@ -114,7 +119,7 @@ class DotsOverlay:
         marks = (self._columns, self._rows, self._blocked, self._dots, self._computed)
         for item in (*marks, self._reference):
             item.setVisible(visible)
-        self._draw_labels(self._correction, self._drawn[0])
+        self._draw_labels()
 
     def show_box(self, one: tuple[float, float], other: tuple[float, float]) -> None:
         """Show the selection box."""
@@ -126,21 +131,8 @@ class DotsOverlay:
         """Hide the selection box."""
         self._box.hide()
 
-    def _draw_lines(self, dots_px: FloatArray) -> None:
-        for item, joints in zip(
-            (self._columns, self._rows, self._blocked), self._joints, strict=False
-        ):
-            item.setData(*dots_px[joints.ravel()].T, connect="pairs")
-        if not self._joints:
-            for item in (self._columns, self._rows, self._blocked):
-                item.setData([], [])
-
-    def _draw_dots(
-        self, correction: Correction | None, dots_px: FloatArray, selection: IntArray
-    ) -> None:
-        if correction is None:
-            self._dots.setData([], [])
-            return
+    def _draw_dots(self) -> None:
+        correction, (dots_px, selection) = self._correction, self._drawn
         lattice = correction.lattice
         chosen = np.zeros(len(dots_px), bool)
         chosen[selection] = True
@@ -157,24 +149,24 @@ class DotsOverlay:
             brush=[brush for _, brush in looks],
         )
 
-    def _draw_labels(self, correction: Correction | None, dots_px: FloatArray) -> None:
-        ends = () if correction is None else picking.row_ends(correction.lattice.row, dots_px)
+    def _draw_labels(self) -> None:
+        lattice, dots_px = self._correction.lattice, self._drawn[0]
+        ends = picking.row_ends(lattice.row, dots_px)
         while len(self._labels) < len(ends):
             label = pg.TextItem(anchor=(1, 0.5), fill=(0, 0, 0, 60))
             self._labels.append(label)
             self._view.add(label)
         beside = (0.6 * self._size + 2) * self._view.px_per_point
-        blocked = frozenset() if correction is None else correction.lattice.blocked_rows
-        for label, end in zip(self._labels, ends, strict=False):
-            row, dot = end
-            label.setText(f"{row} {BLOCKED}" if row in blocked else str(row), row_color(row))
+        for label, (row, dot) in zip(self._labels, ends, strict=False):
+            sign = f" {BLOCKED}" if row in lattice.blocked_rows else ""
+            label.setText(f"{row}{sign}", row_color(row))
             label.setPos(dots_px[dot, 0] - beside, dots_px[dot, 1])
         for n, label in enumerate(self._labels):
             label.setVisible(n < len(ends) and self._dots.isVisible())
 
-    def _draw_reference(self, correction: Correction | None) -> None:
-        site = None if correction is None else correction.lattice.reference
-        place = None if correction is None or site is None else picking.site_px(correction, site)
+    def _draw_reference(self) -> None:
+        site = self._correction.lattice.reference
+        place = None if site is None else picking.site_px(self._correction, site)
         at = np.zeros((0, 2)) if place is None else place[None]
         self._reference.setData(*at.T, size=np.full(len(at), 2 * self._size))
 
@@ -212,10 +204,8 @@ def _apart(dots_px: FloatArray) -> float:
     return float(np.median(scipy.spatial.cKDTree(dots_px).query(dots_px, 2)[0][:, 1]))
 
 
-def _joints(correction: Correction | None) -> tuple[IntArray, ...]:
+def _joints(correction: Correction) -> tuple[IntArray, IntArray, IntArray]:
     """Joined dots: along columns, along rows, along blocked rows."""
-    if correction is None:
-        return ()
     lattice = correction.lattice
     along_rows, along_columns = picking.joints(lattice.row, lattice.column)
     blocked = np.isin(lattice.row[along_rows[:, 0]], list(lattice.blocked_rows))

@@ -10,7 +10,7 @@ import pyqtgraph as pg
 from labapp.config.setup_text import lens_of
 from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.boards import BOARDS
-from labapp.core.calibration.imaging_plane import Calibration
+from labapp.core.calibration.imaging_plane import Calibration, calibrate_imaging_plane
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.files import write_file
@@ -170,7 +170,7 @@ class PlanePage(Page):
         self._finding = self.start_latest(
             "Looking for O′ and the axes",
             (tuple(map(id, images)), unit, lens),
-            lambda _: presenter.find(images, unit, lens),
+            lambda _: calibrate_imaging_plane(images, unit, lens=lens),
             found,
         )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from labapp.config.setup_text import image_calibration_of, lens_of
 from labapp.core.calibration.board_calibration import BoardCalibration
-from labapp.core.calibration.imaging_plane import Calibration, calibrate_imaging_plane
+from labapp.core.calibration.imaging_plane import Calibration
 from labapp.core.calibration.mark_fit import Model, root_mean_square
 from labapp.core.calibration.plane_calibration import (
     ANGLE_TOLERANCE_DEG,
@@ -19,7 +19,6 @@ from labapp.core.calibration.plane_calibration import (
     Z_UNITS,
     PlaneCalibration,
 )
-from labapp.core.geometry.coordinates import Lens
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, round_factor
 from labapp.gui.pages.kept_picture import KeptPicture
@@ -44,11 +43,6 @@ UNPLACED = LARGEST_PX
 UNIT_MM = Target().unit_mm
 
 Place = tuple[float, float]
-
-
-def find(images: Sequence[GreyImage], unit_mm: float, lens: Lens | None) -> Calibration:
-    """Find O′ and the axes, or the corners of a board; raises `CannotMeasure` with the reason."""
-    return calibrate_imaging_plane(images, unit_mm, lens=lens)
 
 
 def first_points(shape: tuple[int, int], unit_mm: float) -> PlaneCalibration:
