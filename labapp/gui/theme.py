@@ -58,6 +58,13 @@ def is_dark(look: QPalette) -> bool:
     return look.color(Role.Window).lightness() < 128
 
 
+def faint(colour: QColor | str, alpha: int) -> QColor:
+    """A colour with an opacity, 0 … 255."""
+    paler = QColor(colour)
+    paler.setAlpha(alpha)
+    return paler
+
+
 class FollowsTheme:
     """Base of widgets with colours outside the palette; precedes Qt's class in the bases."""
 

@@ -114,13 +114,10 @@ def trace(pool: PoolSurface, rig: Rig, torch: Torch | None = None) -> Reflection
     limit = (rig.imaging_plane.width_mm, rig.imaging_plane.height_mm)
     torch = torch or YozTorch(rig.electrode.height_mm)
     incident_blocked, reflected_blocked = torch.hides(point, incident, reflected)
-    absent = np.zeros(hit.shape, bool)
-    for i, j in rig.pattern.absent_rays:
-        absent[i - 1, j - 1] = True
     hits_again = np.zeros(hit.shape, bool)
     hits_again[hit] = _hits_again(pool, point[hit], reflected[hit])
     return Reflections(
-        absent=absent,
+        absent=rig.pattern.is_absent,
         hit=hit,
         incident_blocked=incident_blocked,
         reflected_blocked=reflected_blocked,

@@ -175,9 +175,7 @@ def _shown(mirror: Mirror, rig: Rig) -> tuple[FloatArray, BoolArray]:
     size = rig.imaging_plane.width_mm, rig.imaging_plane.height_mm
     with np.errstate(invalid="ignore"):
         shown = hit & ((plane >= 0) & (plane <= size)).all(axis=-1)
-    for i, j in rig.pattern.absent_rays:
-        shown[i - 1, j - 1] = False
-    return plane, shown
+    return plane, shown & ~rig.pattern.is_absent
 
 
 def _expected_match(rig: Rig, pool: Cap) -> Match:
@@ -187,8 +185,7 @@ def _expected_match(rig: Rig, pool: Cap) -> Match:
     ground = intersect_level(rig.laser.position_mm, ray_directions(rig.laser, rig.pattern))
     outside = np.hypot(ground[..., 0], ground[..., 1]) > pool.diameter_mm / 2
     ray_states = np.where(shown, 1, np.where(outside, -1, 0))
-    for i, j in rig.pattern.absent_rays:
-        ray_states[i - 1, j - 1] = 0
+    ray_states[rig.pattern.is_absent] = 0
     return Match(
         orientation="S/S",
         dot=np.arange(len(ray)),

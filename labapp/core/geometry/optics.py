@@ -151,7 +151,4 @@ def project_rays(laser: Laser, pattern: DotPattern) -> ProjectedRays:
     """Compute the rays of a pattern from a laser, and their landing points."""
     directions = ray_directions(laser, pattern)
     landing = intersect_level(laser.position_mm, directions)
-    absent = np.zeros(directions.shape[:2], bool)
-    for i, j in pattern.absent_rays:
-        absent[i - 1, j - 1] = True
-    return ProjectedRays(directions, landing, absent)
+    return ProjectedRays(directions, landing, pattern.is_absent)

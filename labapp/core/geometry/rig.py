@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from labapp.core.geometry.patterns import MEASURED, PATTERNS, MeasuredRay, measured_steps
 from labapp.core.geometry.uncertainty import RigUncertainty
-from labapp.core.values import FloatArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
 
 @dataclass(frozen=True)
@@ -145,6 +145,15 @@ class DotPattern:
         """Rays ``(i, j)`` that do not exist: absent, outside the outline, or not measured."""
         assert self.absent is not None
         return self.absent | self._outside | self._within - self._listed
+
+    @cached_property
+    def is_absent(self) -> BoolArray:
+        """Mask of the `absent_rays`, shape (rows, columns), read-only."""
+        mask = np.zeros((self.rows, self.columns), bool)
+        for i, j in self.absent_rays:
+            mask[i - 1, j - 1] = True
+        mask.flags.writeable = False
+        return mask
 
     @cached_property
     def _listed(self) -> frozenset[tuple[int, int]]:

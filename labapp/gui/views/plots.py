@@ -12,7 +12,6 @@ import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QPointF, Qt, Signal
 from PySide6.QtGui import (
-    QColor,
     QFontMetricsF,
     QGuiApplication,
     QKeyEvent,
@@ -22,7 +21,7 @@ from PySide6.QtWidgets import QGraphicsItem, QSizePolicy, QVBoxLayout
 
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_text
-from labapp.gui.theme import RED, is_dark
+from labapp.gui.theme import RED, faint, is_dark
 from labapp.gui.views.axes import paint_axes, plain_axes
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.views.picture_files import save_plot
@@ -119,7 +118,7 @@ class PlotStack(Plotted):
         if points:
             place = float(points[0][0].x[points[0][1]])
         for plot in self._plots:
-            plot.mark_place(place)
+            _put(plot.current, place)
         self._show_read_out(
             _joined([point_text(curve, index, self.axis) for curve, index in points])
         )
@@ -199,12 +198,12 @@ class PlotStack(Plotted):
         found = self._under(at)
         if found is None:
             for plot in self._plots:
-                plot.show_cross(None)
+                _put(plot.cross, None)
             return
         plot, curve = found
         x = float(plot.getViewBox().mapSceneToView(at).x())
         for each in self._plots:
-            each.show_cross(x)
+            _put(each.cross, x)
         index = nearest(curve, x)
         if index is not None:
             self._show_read_out(point_text(curve, index, self.axis))
@@ -292,14 +291,14 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         look_of = {"color": text.name(), "bold": True, "justify": "left", "size": size}
         self.titleLabel.setText(curve.title, **look_of)
         self.showGrid(x=True, y=True, alpha=0.18)
-        line = _faint(accent, 110) if len(curve.key) else accent
+        line = faint(accent, 110) if len(curve.key) else accent
         self.line.setPen(pg.mkPen(line, width=1))
-        self.bars.setPen(pg.mkPen(_faint(accent, 150), width=1))
-        self.level.setPen(pg.mkPen(_faint(text, 150), width=1, style=Qt.PenStyle.DashLine))
+        self.bars.setPen(pg.mkPen(faint(accent, 150), width=1))
+        self.level.setPen(pg.mkPen(faint(text, 150), width=1, style=Qt.PenStyle.DashLine))
         for line in self.limits:
             line.setPen(pg.mkPen(RED[is_dark(look)], width=1.5, style=Qt.PenStyle.DashLine))
         self.current.setPen(pg.mkPen(accent, width=1.5))
-        self.cross.setPen(pg.mkPen(_faint(text, 90), width=1))
+        self.cross.setPen(pg.mkPen(faint(text, 90), width=1))
         if curve.from_zero:
             self.getViewBox().setLimits(yMin=0)
 
@@ -313,13 +312,9 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         """Show a curve."""
         self._curve = curve
         self.line.setData(*curve.line)
-        self.level.setVisible(bool(np.isfinite(curve.level)))
-        if np.isfinite(curve.level):
-            self.level.setValue(curve.level)
+        _put(self.level, curve.level if np.isfinite(curve.level) else None)
         for item, limit in zip(self.limits, curve.limits, strict=True):
-            item.setVisible(limit is not None)
-            if limit is not None:
-                item.setValue(limit)
+            _put(item, limit)
         self._show_events(curve)
         self._show_points()
 
@@ -330,18 +325,6 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         self.events = [pg.InfiniteLine(x, angle=90, pen=pen) for x in curve.events.tolist()]
         for line in self.events:
             self.addItem(line, ignoreBounds=True)
-
-    def mark_place(self, x: float | None) -> None:
-        """Draw a vertical line at a position, or none."""
-        self.current.setVisible(x is not None)
-        if x is not None:
-            self.current.setValue(x)
-
-    def show_cross(self, x: float | None) -> None:
-        """Draw the vertical line of the pointer, or none."""
-        self.cross.setVisible(x is not None)
-        if x is not None:
-            self.cross.setValue(x)
 
     def _show_points(self) -> None:
         """Draw the visible points and error bars, unless there are too many to distinguish."""
@@ -391,10 +374,11 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         return SYMBOLS[sign], 7, pg.mkPen(base, width=0.5), pg.mkBrush(accent)
 
 
-def _faint(colour: QColor, alpha: int) -> QColor:
-    paler = QColor(colour)
-    paler.setAlpha(alpha)
-    return paler
+def _put(line: pg.InfiniteLine, at: float | None) -> None:
+    """Show a line at a position; None: hide it."""
+    line.setVisible(at is not None)
+    if at is not None:
+        line.setValue(at)
 
 
 def _index_of(curve: Curve, key: int | None) -> int | None:

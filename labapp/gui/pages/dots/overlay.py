@@ -19,6 +19,7 @@ from PySide6.QtGui import QBrush, QColor, QPen
 from labapp.core.rows.correction import Correction
 from labapp.core.values import FloatArray, IntArray
 from labapp.gui.pages.dots import picking
+from labapp.gui.theme import faint
 from labapp.gui.views.picture import PictureView
 
 ROW_COLORS = ("#e69f00", "#56b4e9", "#2fd39b", "#f0e442", "#6f9bff", "#ff7a3c", "#e58cc0")
@@ -192,9 +193,7 @@ def _look(row: int, sited: bool, blocked: bool, chosen: bool) -> tuple[QPen, QBr
     pen = cosmetic_pen(CHOSEN if chosen else color, 2 if chosen else 1.5, style)
     if blocked:
         return pen, QBrush(QColor(color), Qt.BrushStyle.BDiagPattern)
-    filling = QColor(color)
-    filling.setAlpha(60 if chosen else 0)
-    return pen, QBrush(filling)
+    return pen, QBrush(faint(color, 60 if chosen else 0))
 
 
 def _apart(dots_px: FloatArray) -> float:
@@ -212,7 +211,9 @@ def _joints(correction: Correction) -> tuple[IntArray, IntArray, IntArray]:
     return along_columns, along_rows[~blocked], along_rows[blocked]
 
 
-def cosmetic_pen(color: str, width: float, style: Qt.PenStyle = Qt.PenStyle.SolidLine) -> QPen:
+def cosmetic_pen(
+    color: str | QColor, width: float, style: Qt.PenStyle = Qt.PenStyle.SolidLine
+) -> QPen:
     """A pen whose width, px of the screen, does not grow with the zoom."""
     pen = QPen(QColor(color), width, style)
     pen.setCosmetic(True)
@@ -220,8 +221,4 @@ def cosmetic_pen(color: str, width: float, style: Qt.PenStyle = Qt.PenStyle.Soli
 
 
 def _line(color: str, alpha: int, style: Qt.PenStyle = Qt.PenStyle.SolidLine) -> pg.PlotCurveItem:
-    pen = cosmetic_pen(color, 1, style)
-    shade = QColor(color)
-    shade.setAlpha(alpha)
-    pen.setColor(shade)
-    return pg.PlotCurveItem(pen=pen)
+    return pg.PlotCurveItem(pen=cosmetic_pen(faint(color, alpha), 1, style))

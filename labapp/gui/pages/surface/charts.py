@@ -10,6 +10,7 @@ from labapp.core.surface.boundary import Boundary
 from labapp.core.values import FloatArray
 from labapp.export.rendering.heights import Profile
 from labapp.gui.pages.surface.presenter import error_scale
+from labapp.gui.theme import faint
 from labapp.gui.views.chart import Chart
 from labapp.text import HEIGHT_SIGMA_OF
 
@@ -158,10 +159,9 @@ class ProfileChart(Chart):
         """Take the window's colours."""
         super().take_colours()
         self._height.setPen(pg.mkPen(self.accent, width=2))
-        faint = pg.mkColor(self.accent)
-        faint.setAlpha(BAND_ALPHA)
-        self._band.setBrush(pg.mkBrush(faint))
+        pale = faint(self.accent, BAND_ALPHA)
+        self._band.setBrush(pg.mkBrush(pale))
         for edge in (self._low, self._high):
-            edge.setPen(pg.mkPen(faint))
+            edge.setPen(pg.mkPen(pale))
         self._edge.setPen(pg.mkPen(self.text))
         self._edge.setBrush(pg.mkBrush(None))

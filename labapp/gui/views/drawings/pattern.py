@@ -8,7 +8,7 @@ from PySide6.QtGui import QPainter, QPaintEvent, QPalette, QPen, QPolygonF
 
 from labapp.core.geometry.line_pattern import LineRays
 from labapp.core.geometry.rig import DotPattern
-from labapp.core.values import BoolArray, FloatArray
+from labapp.core.values import FloatArray
 from labapp.gui.views.canvas import Drawn
 
 SIDE_PX, MARGIN_PX = 132, 8
@@ -46,8 +46,7 @@ class PatternView(Drawn):
         super().paintEvent(event)
         if self._pattern is None:
             return
-        tangents, made = self._pattern.tangents, _made(self._pattern)
-        place = self._placed(tangents)
+        place = self._placed(self._pattern.tangents)
         with QPainter(self) as painter:
             painter.setRenderHint(QPainter.RenderHint.Antialiasing)
             ink = self.palette().color(QPalette.ColorRole.Text)
@@ -61,7 +60,7 @@ class PatternView(Drawn):
             for i, j in sorted(self._pattern.absent or ()):
                 painter.drawEllipse(QPointF(*place[i - 1, j - 1].tolist()), radius, radius)
             painter.setBrush(ink)
-            for point in place[made].tolist():
+            for point in place[~self._pattern.is_absent].tolist():
                 painter.drawEllipse(QPointF(*point), radius, radius)
 
     def _placed(self, tangents: FloatArray) -> FloatArray:
@@ -70,14 +69,6 @@ class PatternView(Drawn):
         middle = np.array([self.width(), self.height()]) / 2
         scale = float(((middle - MARGIN_PX) / largest).min())
         return np.asarray(middle + scale * tangents * np.array([1.0, -1.0]))
-
-
-def _made(pattern: DotPattern) -> BoolArray:
-    """Mask of the rays that exist, shape (rows, columns)."""
-    made = np.ones((pattern.rows, pattern.columns), bool)
-    for i, j in pattern.absent_rays:
-        made[i - 1, j - 1] = False
-    return made
 
 
 def _radius(place: FloatArray) -> float:
