@@ -61,7 +61,9 @@ def test_inconsistent_measurement_is_damaged():
     measurement = measurement_of(0)
     assert measurement.match is not None
     assert measurement.reconstruction is not None
+    last_first = measurement.match.ray[::-1]
     for wrong in (
+        replace(measurement, match=replace(measurement.match, ray=last_first)),
         replace(measurement, match=replace(measurement.match, dot=measurement.match.dot + 1)),
         replace(measurement, match=replace(measurement.match, ray=measurement.match.ray + 90)),
         replace(measurement, match=replace(measurement.match, ray=measurement.match.ray[:-1])),

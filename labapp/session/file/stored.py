@@ -92,10 +92,12 @@ def _choices_are_known(value: Any) -> bool:
 
 def _measurement_fits(value: Any) -> bool:
     count = 0 if value.dots is None else len(value.dots)
+    match, found = value.match, value.reconstruction
     return (
         _scheme_is_known(value)
         and (value.lattice is None or len(value.lattice.row) == count)
-        and (value.match is None or _all_within(value.match.dot, 0, count - 1))
+        and (match is None or _all_within(match.dot, 0, count - 1))
+        and (match is None or found is None or np.array_equal(match.ray, found.ray))
     )
 
 

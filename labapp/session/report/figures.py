@@ -229,11 +229,8 @@ def dots_compared(measurement: Measurement) -> bytes:
     found, match = measurement.reconstruction, measurement.match
     assert found is not None
     assert match is not None
-    captured = dict(zip(map(tuple, match.ray.tolist()), match.plane_mm, strict=True))
-    rays = [tuple(ray) for ray in found.ray.tolist()]
-    known = np.array([ray in captured for ray in rays], bool)
-    seen = np.array([captured[ray] for ray in rays if ray in captured]).reshape(-1, 2)
-    computed = seen + found.residual_mm[known]
+    seen = match.plane_mm
+    computed = seen + found.residual_mm
     tall = 1.0 if not len(seen) else np.ptp(seen[:, 1]) / max(np.ptp(seen[:, 0]), 1e-9)
     with new_figure(INCHES * 0.8, float(np.clip(INCHES * 0.8 * tall + 0.6, 1.6, 5.0))) as figure:
         view = figure.subplots()

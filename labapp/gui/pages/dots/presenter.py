@@ -161,14 +161,7 @@ def computed_px(result: Result | None) -> FloatArray:
     match, surface = result.measurement.match, result.measurement.reconstruction
     if match is None or surface is None:
         return NO_PLACES
-    pair_of = {tuple(ray): n for n, ray in enumerate(match.ray.tolist())}
-    points = [
-        (n, pair_of[tuple(ray)])
-        for n, ray in enumerate(surface.ray.tolist())
-        if tuple(ray) in pair_of
-    ]
-    point, pair = np.array(points, int).reshape(-1, 2).T
-    plane = match.plane_mm[pair] + surface.residual_mm[point]
+    plane = match.plane_mm + surface.residual_mm
     met = np.isfinite(plane).all(axis=1)
     return result.parsed_setup.calibration.to_image(plane[met])
 
