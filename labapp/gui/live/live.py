@@ -261,7 +261,9 @@ class Live:
         except OSError:
             self.room_byte = None
         depth = None if self.feed is None else self.feed.bit_depth
-        self._judged.append(self._dots.judge(frame.image, depth, rays_of(self.setup)))
+        pattern = None if self.setup is None else self.setup.rig.pattern
+        rays = None if pattern is None else pattern.rows * pattern.columns
+        self._judged.append(self._dots.judge(frame.image, depth, rays))
 
     # --- to look at ---------------------------------------------------------------------------
 
@@ -407,11 +409,6 @@ class Live:
     def apply(self, wanted: CameraSettings) -> Future[CameraSettings] | None:
         """Set the camera between two frames; the future gives the values actually set."""
         return self.feed.apply(wanted) if self.feed is not None and self.is_open else None
-
-
-def rays_of(setup: Setup | None) -> int | None:
-    """Number of rays of the pattern; None if the set-up is incomplete."""
-    return None if setup is None else setup.rig.pattern.rows * setup.rig.pattern.columns
 
 
 def measured_with(session: Session) -> tuple[Setup | None, Settings | None]:

@@ -47,7 +47,7 @@ RULE = (
 )
 
 
-def trend_curves(trend: LiveSizes, limits: Limits, names: tuple[str, ...]) -> tuple[Curve, ...]:
+def trend_curves(trend: LiveSizes, limits: Limits) -> tuple[Curve, ...]:
     """Width, length and height against the time from now, with their limits."""
     # A frame without values inside a gap keeps a line from crossing it.
     gap = np.flatnonzero(np.diff(trend.since_s) > GAP_S) + 1
@@ -66,7 +66,7 @@ def trend_curves(trend: LiveSizes, limits: Limits, names: tuple[str, ...]) -> tu
             limits=limits.of(name),
             quick=True,
         )
-        for k, name in enumerate(names)
+        for k, name in enumerate(trend.names)
     )
 
 
@@ -159,7 +159,7 @@ class LiveTrends(QWidget):
         limits = watch.alarms.limits
         trend = watch.trend.over(last_s, limits)
         axis = Axis("From now", "s", decimals=1, span=(-last_s, 0.0))
-        self.plots.show_curves(trend_curves(trend, limits, trend.names), axis)
+        self.plots.show_curves(trend_curves(trend, limits), axis)
 
     # --- what is done -------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from labapp.gui.tools.analysis_presenter import BUDGET, OPENED, PARTS, USUAL
 from labapp.gui.tools.tool import WORKING, ToolWindow, progress_of
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, flush_fields, whole
 from labapp.gui.widgets.labels import heading, offer, show_words, wrapping_label
+from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 from labapp.studies import SCHEME_NAMES
@@ -114,11 +115,7 @@ class AnalysisWindow(ToolWindow):
         self.stack = QStackedWidget()
         for widget in (self.table, self.sheet):
             self.stack.addWidget(widget)
-        self.results.addWidget(self.why)
-        self.results.addWidget(self.former)
-        self.results.addWidget(line)
-        self.results.addWidget(self.words)
-        self.results.addWidget(self.stack, 1)
+        fill(self.results, self.why, self.former, line, self.words, (self.stack, 1))
         self.stack.hide()
         self._line = line
         line.hide()

@@ -16,7 +16,7 @@ from labapp.gui.tools.tool import WORKING, ToolWindow
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, NumberField, flush_fields
 from labapp.gui.widgets.labels import heading, offer, wrapping_label
-from labapp.gui.widgets.layouts import column_of, hbox, tabs_of
+from labapp.gui.widgets.layouts import column_of, fill, hbox, tabs_of
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 
@@ -83,10 +83,7 @@ class DynamicsWindow(ToolWindow):
         self.play_button = button("Play", tip, self.play)
         tip = "Show the frame of this event in the main window"
         self.frame_button = button("Show the frame", tip, self.show_frame)
-        for table, changed in (
-            (self.modes, self._show_mode),
-            (self.events, self.show_state),
-        ):
+        for table, changed in ((self.modes, self._show_mode), (self.events, self.show_state)):
             table.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
             table.itemSelectionChanged.connect(changed)
         self.events.cellActivated.connect(lambda *_: self.show_frame())
@@ -106,9 +103,7 @@ class DynamicsWindow(ToolWindow):
         self.tabs.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Ignored)
         self.tabs.setMinimumHeight(self.tabs.minimumSizeHint().height())
         self.tabs.currentChanged.connect(lambda _: self._turn.stop())
-        self.results.addWidget(self.words)
-        self.results.addWidget(self.tabs, 1)
-        self.results.addStretch()
+        fill(self.results, self.words, (self.tabs, 1), 0)
         self.tabs.hide()
 
     def _make_buttons(self) -> None:

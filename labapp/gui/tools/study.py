@@ -25,7 +25,7 @@ from labapp.gui.widgets.fields import (
     whole,
 )
 from labapp.gui.widgets.labels import heading, offer, show_words, wrapping_label
-from labapp.gui.widgets.layouts import column_of, tabs_of
+from labapp.gui.widgets.layouts import column_of, fill, tabs_of
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable, FittingTable
@@ -131,8 +131,7 @@ class StudyWindow(ToolWindow):
             table.itemSelectionChanged.connect(self.show_state)
             table.cellDoubleClicked.connect(lambda *_: self.open_selected())
         self.tabs.currentChanged.connect(lambda _: self.show_state())
-        self.results.addWidget(self.words)
-        self.results.addWidget(self.tabs, 1)
+        fill(self.results, self.words, (self.tabs, 1))
 
     def _make_buttons(self) -> None:
         self.page_button = self.add_button(

@@ -164,9 +164,8 @@ def test_trends_show_limits_and_mark_values_beyond_them():
         np.full((3, 3), 0.03),
         np.array([[False, False, True], [False] * 3, [False] * 3]),
     )
-    width, length, depth = trend_curves(
-        trend, Limits(width_mm=(6.0, 6.9), height_mm=(-0.4, None)), trend.names
-    )
+    limits = Limits(width_mm=(6.0, 6.9), height_mm=(-0.4, None))
+    width, length, depth = trend_curves(trend, limits)
     assert (width.limits, length.limits, depth.limits) == ((6.0, 6.9), (None, None), (-0.4, None))
     assert width.mark.tolist() == [0, 0, 0, 1]
     assert depth.title == "Depth (mm)"
