@@ -22,6 +22,7 @@ from labapp.core.bench_check.check import adjusted_bench, check_bench
 from labapp.core.bench_check.forecast import forecast, height_sigma
 from labapp.core.bench_check.labelling import MirrorDots
 from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
@@ -180,7 +181,7 @@ def main() -> None:
                     MirrorDots(m.name, m, dots_at(place), SHAPE) for m, place, _ in sightings
                 ]
                 try:
-                    check = check_bench(pictures, BEHIND_GLASS, CALIBRATION)
+                    check = check_bench(pictures, Bench(BEHIND_GLASS, CALIBRATION))
                 except CannotMeasure as error:
                     statuses[name][error.status] += 1
                     continue
@@ -188,8 +189,8 @@ def main() -> None:
                 results[name] = check.rig, check.calibration.to_plane
             else:
                 adjustment = adjust(BEHIND_GLASS, [sighting(*one) for one in sightings])
-                rig, calibration = adjusted_bench(BEHIND_GLASS, adjustment, checked=True)
-                results[name] = rig, calibration.to_plane
+                after = adjusted_bench(BEHIND_GLASS, adjustment, checked=True)
+                results[name] = after.rig, after.calibration.to_plane
         by_truth = np.nan
         for name, (rig, to_plane) in results.items():
             height_mm, sigma = measured(pool, bench, rig, to_plane, seed)

@@ -111,7 +111,8 @@ def checked(rig: Rig, bench: SimulatedBench, rng: np.random.Generator) -> Rig:
     bench = replace(bench, rig=replace(bench.rig, electrode=without_torch.electrode))
     for mirror in MIRRORS:
         sightings.append(sighting(mirror, *seen_dots(surface_like(mirror, rng), bench, rng)))
-    adjusted, _ = adjusted_bench(without_torch, adjust(without_torch, sightings), checked=True)
+    found = adjust(without_torch, sightings)
+    adjusted = adjusted_bench(without_torch, found, checked=True).rig
     return replace(adjusted, electrode=rig.electrode)
 
 

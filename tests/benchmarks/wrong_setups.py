@@ -18,6 +18,7 @@ import numpy as np
 from labapp.core.bench_check.check import BenchCheck, check_bench
 from labapp.core.bench_check.labelling import MirrorDots
 from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.simulation.camera import CameraView
@@ -105,11 +106,11 @@ def checked(
         for m in mirrors
     ]
     try:
-        check = check_bench(pictures, RIG, CALIBRATION)
+        check = check_bench(pictures, Bench(RIG, CALIBRATION))
         named = [one.key for one in check.suspects]
         verdict = f"{check.status} {' or '.join(named)}".strip()
         if check.status == "quantity-off":
-            check = check_bench(pictures, RIG, CALIBRATION, named[:1])
+            check = check_bench(pictures, Bench(RIG, CALIBRATION), named[:1])
             verdict += f"; freed {named[0]}: {check.status}"
     except CannotMeasure as error:
         return None, error.status

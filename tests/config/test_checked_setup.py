@@ -36,10 +36,11 @@ def check_of(text: str, covariance: np.ndarray | None = None) -> BenchCheck:
         field: {"offset": OFFSET, "covariance": covariance}.get(field, nothing)
         for field in Adjustment.__dataclass_fields__
     })  # fmt: skip
-    rig, calibration = adjusted_bench(before, adjustment, checked=True)
+    after = adjusted_bench(before, adjustment, checked=True)
     return BenchCheck(
-        "ok", "", "noise-like", (), (), (), before, rig, calibration, (), (), adjustment
-    )  # fmt: skip
+        *("ok", "", "noise-like", (), (), (), before),
+        *(after.rig, after.calibration, (), (), adjustment),
+    )
 
 
 def checked_text(text: str = SETUP) -> str:
@@ -147,8 +148,8 @@ def test_exactly_known_quantity_remains_exact_in_a_check() -> None:
     offset, covariance = OFFSET.copy(), np.diag(SIGMA**2)
     offset[index] = covariance[index, index] = 0.0
     adjustment = replace(check.adjustment, offset=offset, covariance=covariance)
-    rig, calibration = adjusted_bench(check.before, adjustment, checked=True)
-    check = replace(check, rig=rig, calibration=calibration)
+    after = adjusted_bench(check.before, adjustment, checked=True)
+    check = replace(check, rig=after.rig, calibration=after.calibration)
     assert status(checked_setup(text, PATH, check, DATE)) == "checked"
 
 

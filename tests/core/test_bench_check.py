@@ -62,7 +62,7 @@ z_axis_px = {list(VIEW.z_axis_px)}
 z_axis_mm = {VIEW.z_axis_mm}
 """
 SETUP = parse_setup(TEXT, "setup.toml")
-RIG, CALIBRATION = SETUP.rig, SETUP.calibration
+BENCH, RIG, CALIBRATION = SETUP.bench, SETUP.rig, SETUP.calibration
 EXACT = SimulatedBench(replace(RIG, uncertainty=None), VIEW)
 
 
@@ -92,9 +92,7 @@ def check_of(bench: SimulatedBench, free: tuple[str, ...] = ()) -> BenchCheck:
     rng = np.random.default_rng(9)
     tack = Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (0.2, -0.1))
     pairs = [(Plate(), FlatMirror(0.01, 0.001, -0.001)), tack]
-    return check_bench(
-        [picture(*each, bench, rng)[0] for each in pairs], RIG, CALIBRATION, list(free)
-    )
+    return check_bench([picture(*each, bench, rng)[0] for each in pairs], BENCH, list(free))
 
 
 @pytest.mark.parametrize(
@@ -131,7 +129,7 @@ def test_plate_rays_are_labelled_on_a_misaligned_bench(seed: int):
     rng = np.random.default_rng([5, seed])
     bench = draw_bench(RIG, VIEW, BenchErrors(), rng)
     plate, ray = picture(Plate(), FlatMirror(), bench, rng, missing=0.05, false=8)
-    labels = label_picture(plate, RIG, CALIBRATION).labels
+    labels = label_picture(plate, BENCH).labels
     labelled = np.argwhere(labels >= 0)
     true_ray = ray[labels[tuple(labelled.T)]]
     assert len(labelled) > 0.97 * (ray[:, 0] >= 0).sum()
@@ -145,7 +143,7 @@ def test_labelling_fails_without_the_reference_hole():
     above_hole = ray[:, 0] > 10  # only rows above the hole
     dots = as_dots(full.dots.image_px[above_hole], 0.12)
     with pytest.raises(CannotMeasure) as error:
-        label_picture(replace(full, dots=dots), RIG, CALIBRATION)
+        label_picture(replace(full, dots=dots), BENCH)
     assert error.value.status in ("no-reference", "ambiguous-rows", "no-match")
 
 
@@ -231,7 +229,7 @@ def test_plate_is_labelled_if_the_camera_is_mirrored_or_turned(view: list[list[i
     seen = usual.dots.image_px @ to_seen[:2, :2].T + to_seen[:2, 2]
     plate = MirrorDots("plate", Plate(), as_dots(seen, 0.12), (640, 640))
     calibration = ImageCalibration(CALIBRATION.matrix @ np.linalg.inv(to_seen))
-    labels = label_picture(plate, RIG, calibration).labels
+    labels = label_picture(plate, Bench(RIG, calibration)).labels
     assert labels[tuple(ray.T)].tolist() == list(range(len(ray)))
 
 
@@ -250,7 +248,7 @@ def test_written_setup_is_the_adjusted_one():
     image_px = ideal.to_image(reflections.plane_mm[reflections.visible])
     dots = as_dots(image_px + rng.normal(0, 0.12, image_px.shape), 0.12)
     plate = MirrorDots("plate", Plate(), dots, SHAPE)
-    check = check_bench([plate], setup.rig, setup.calibration, ["picture.u", "picture.v"])
+    check = check_bench([plate], setup.bench, ["picture.u", "picture.v"])
     assert check.status == "ok"
     read = parse_setup(checked_setup(text, "setup.toml", check, "2026-11-24T12:00:00+00:00"), "")
     (result,) = check.pictures
@@ -280,7 +278,7 @@ def test_quantity_far_off_is_named_and_corrected_when_free():
 def test_check_fails_where_a_mirror_contradicts_its_known_size(truth: float):
     rng = np.random.default_rng(9)
     pairs = [(Plate(), FlatMirror()), (Cap(9.75, 0.91), spherical_cap(9.75, truth, (0.2, -0.1)))]
-    check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], RIG, CALIBRATION)
+    check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], BENCH)
     radius, height = check.pictures[1].sizes
     assert check.status == ("ok" if truth == 0.91 else "size-off")
     assert radius.is_contradicted == (truth != 0.91)
@@ -298,7 +296,7 @@ def test_labels_a_row_off_are_reported(absent: list[int]):
     setup = parse_setup(TEXT.replace(angle, f"{angle}absent = [{absent}]\n"), "setup.toml")
     rng = np.random.default_rng(0)
     pictures = [picture(Plate(height), FlatMirror(height), EXACT, rng)[0] for height in (0.0, 2.0)]
-    check = check_bench(pictures, setup.rig, setup.calibration)
+    check = check_bench(pictures, setup.bench)
     assert check.status == "row-slipped"
     assert all(abs(one.after - one.before) <= 2.0 * one.before_sigma for one in check.changes)
 
@@ -331,7 +329,7 @@ def test_model_errors_are_named(plate: FlatMirror, pattern: DotPattern, verdict:
         picture(Plate(), plate, bench, rng)[0],
         picture(Plate(2.0), FlatMirror(2.0), bench, rng)[0],
     ]
-    check = check_bench(pictures, RIG, CALIBRATION)
+    check = check_bench(pictures, BENCH)
     assert check.status == check.verdict == verdict
     uncertainty = check.rig.uncertainty
     assert uncertainty is not None
@@ -345,7 +343,7 @@ def test_plate_0_05_mm_from_flat_is_reported(bend_per_mm: tuple[float, float]):
     rng = np.random.default_rng(4)
     tack = Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (0.2, -0.1))
     pairs = [(Plate(), FlatMirror(bend_per_mm=bend_per_mm)), tack]
-    check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], RIG, CALIBRATION)
+    check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], BENCH)
     assert check.status in ("plate-not-flat", "size-off")
     assert REASONS["plate-not-flat"] in check.reason
 
@@ -355,7 +353,7 @@ def test_plate_0_05_mm_from_flat_is_reported(bend_per_mm: tuple[float, float]):
 def test_wrong_plate_height_is_reported(height_mm: float):
     rng = np.random.default_rng(4)
     pairs = [(Plate(), FlatMirror()), (Plate(2.0), FlatMirror(height_mm))]
-    check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], RIG, CALIBRATION)
+    check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], BENCH)
     assert check.status == "size-off"
     assert "height in plate at 2 mm" in check.reason
     size = check.pictures[1].sizes[0]
@@ -370,7 +368,7 @@ def test_check_fails_with_a_strongly_bent_plate():
         picture(Plate(), bent, EXACT, rng)[0],
         picture(Plate(2.0), FlatMirror(2.0), EXACT, rng)[0],
     ]
-    assert check_bench(pictures, RIG, CALIBRATION).status != "ok"
+    assert check_bench(pictures, BENCH).status != "ok"
 
 
 @pytest.mark.slow
@@ -388,7 +386,7 @@ def test_single_mirror_in_a_rendered_picture_is_measured(kind: str, seed: int):
     }[kind]
     image = render(trace(surface, bench.rig), bench.view, Look(glow=0.0), rng).image
     dots = find_mirror_dots(image, DotSettings())
-    check = check_bench([MirrorDots(kind, mirror, dots, image.shape)], RIG, CALIBRATION)
+    check = check_bench([MirrorDots(kind, mirror, dots, image.shape)], BENCH)
     assert check.status == "ok"
     for size in check.pictures[0].sizes:
         assert size.measured_mm == pytest.approx(size.known_mm, rel=0.01)
@@ -405,7 +403,7 @@ def test_dot_noise_is_not_mistaken_for_a_wrong_scale(level_deg: float):
     reflections = trace(FlatMirror(), EXACT.rig)
     image_px = VIEW.to_image(reflections.plane_mm)[reflections.visible]
     dots = as_dots(image_px + rng.normal(0, 0.2, image_px.shape), 0.2)
-    check = check_bench([MirrorDots("plate", plate, dots, SHAPE)], RIG, CALIBRATION)
+    check = check_bench([MirrorDots("plate", plate, dots, SHAPE)], BENCH)
     assert (check.status, check.suspects) == ("ok", ())
 
 
@@ -465,7 +463,7 @@ def test_blind_spot_of_a_single_plate_is_reported():
     rng = np.random.default_rng(4)
     correct, too_high = (picture(Plate(), FlatMirror(z), EXACT, rng)[0] for z in (0.0, 0.5))
     second = picture(Plate(2.0), FlatMirror(2.0), EXACT, rng)[0]
-    biased = check_bench([too_high], RIG, CALIBRATION)
+    biased = check_bench([too_high], BENCH)
     assert biased.status == "ok"
     pool = spherical_cap(6.7, 0.3)
     match = exact_match(trace(pool, EXACT.rig))
@@ -474,12 +472,10 @@ def test_blind_spot_of_a_single_plate_is_reported():
     measures = measure_surface(fit.reconstruct(match, biased.rig, FitSettings()), match, biased.rig)
     error = abs(measures.height_mm - pool.peak_mm)
     assert error > measures.height_sigma_mm
-    (of_biased,), (of_correct,) = map(
-        blind_spots, (biased, check_bench([correct], RIG, CALIBRATION))
-    )
+    (of_biased,), (of_correct,) = map(blind_spots, (biased, check_bench([correct], BENCH)))
     assert of_biased.picture == of_correct.picture == correct.name
     assert 0.5 < of_biased.noticed_mm < 2.0
     assert error < of_correct.pool_mm < 3 * error
-    assert check_bench([too_high, second], RIG, CALIBRATION).status == "size-off"
+    assert check_bench([too_high, second], BENCH).status == "size-off"
     assert blind_spots(replace(biased, status="size-off")) == ()
-    assert blind_spots(check_bench([correct, second], RIG, CALIBRATION)) == ()
+    assert blind_spots(check_bench([correct, second], BENCH)) == ()

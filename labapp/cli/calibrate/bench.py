@@ -103,7 +103,7 @@ def _checked(
             raise InputError("--free", "key", key, f"one of {', '.join(suspect_keys())}")
     try:
         found = [mirror_picture(path, one) for path, one in zip(pictures, mirrors, strict=True)]
-        return check_bench(found, known.rig, known.calibration, free)
+        return check_bench(found, known.bench, free)
     except CannotMeasure as answer:
         typer.echo(f"{setup}: {answer}", err=True)
         raise typer.Exit(NOTHING_MEASURED) from answer

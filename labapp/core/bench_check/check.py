@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -159,10 +160,7 @@ class QuantityChange:
 
 
 def check_bench(
-    pictures: Sequence[MirrorDots],
-    rig: Rig,
-    calibration: ImageCalibration,
-    free: Sequence[str] = (),
+    pictures: Sequence[MirrorDots], bench: Bench, free: Sequence[str] = ()
 ) -> BenchCheck:
     """Adjust the set-up to pictures of known mirrors.
 
@@ -170,7 +168,7 @@ def check_bench(
     ----------
     pictures
         One or several pictures of mirrors, each with its own pose.
-    rig, calibration
+    bench
         The set-up before the check; its uncertainty is the prior.
     free
         Keys of suspects (`suspects.suspect_keys`) whose prior is widened.
@@ -180,11 +178,11 @@ def check_bench(
     CannotMeasure
         As `label_picture`.
     """
+    rig = bench.rig
     pictures = [replace(one, mirror=placed(one.mirror, rig)) for one in pictures]
     freed = freed_directions(rig, free)
-    bench = Bench(rig, calibration)
     observed = [Observation.of(p.dots, bench, p.frame_shape) for p in pictures]
-    made, sightings, used = _adjusted(pictures, observed, rig, calibration, freed)
+    made, sightings, used = _adjusted(pictures, observed, bench, freed)
     suspects = find_suspects(rig, sightings, made, freed)
     seen = [(o, p.mirror, own) for o, p, own in zip(observed, pictures, used, strict=True)]
     slip = slip_cost_fall(rig, seen, made, freed)
@@ -196,7 +194,7 @@ def check_bench(
         for size in own
     }
     status, reason = _status(suspects, verdict, patterns, slip, named)
-    after, calibrated = adjusted_bench(rig, made, status == "ok")
+    after = adjusted_bench(rig, made, status == "ok")
     checked = tuple(
         CheckedPicture(
             picture=picture,
@@ -216,8 +214,8 @@ def check_bench(
         suspects=suspects,
         free=tuple(free),
         before=rig,
-        rig=after,
-        calibration=calibrated,
+        rig=after.rig,
+        calibration=after.calibration,
         pictures=checked,
         sightings=tuple(sightings),
         adjustment=made,
@@ -227,22 +225,21 @@ def check_bench(
 def _adjusted(
     pictures: Sequence[MirrorDots],
     observed: Sequence[Observation],
-    rig: Rig,
-    calibration: ImageCalibration,
+    bench: Bench,
     freed: FloatArray,
 ) -> tuple[Adjustment, list[Sighting], list[IntArray]]:
     """Adjust and label again in turn until no label changes.
 
     Returns the adjusted set-up, the dots of each picture that were used, and their labels.
     """
-    labels = _labelled(pictures, rig, calibration, freed)
+    labels = _labelled(pictures, bench, freed)
     made: Adjustment | None = None
     for _ in range(ROUNDS):
         sightings = [
             sighting_of(o, p.mirror, found)
             for o, p, found in zip(observed, pictures, labels, strict=True)
         ]
-        made = adjust(rig, sightings, freed, None if made is None else made.unknown)
+        made = adjust(bench.rig, sightings, freed, None if made is None else made.unknown)
         again = [
             relabelled(o, p.mirror, made.offset, pose)
             for o, p, pose in zip(observed, pictures, made.poses, strict=True)
@@ -260,39 +257,31 @@ def _adjusted(
     return made, sightings, used
 
 
-def _labelled(
-    pictures: Sequence[MirrorDots],
-    rig: Rig,
-    calibration: ImageCalibration,
-    freed: FloatArray,
-) -> list[IntArray]:
+def _labelled(pictures: Sequence[MirrorDots], bench: Bench, freed: FloatArray) -> list[IntArray]:
     """Label each picture; plates first, as they determine the bench for the others."""
     order = sorted(range(len(pictures)), key=lambda k: not isinstance(pictures[k].mirror, Plate))
     labels: dict[int, IntArray] = {}
-    near = rig, calibration
+    near, wide = bench, Bench(_wide(bench.rig), bench.calibration)
     for k in order:
-        benches = [near, (rig, calibration), (_wide(rig), calibration)]
-        found, seen_by = _first_label(pictures[k], benches, freed)
+        found, seen_by = _first_label(pictures[k], (near, bench, wide), freed)
         labels[k] = found.labels
         near = adjusted_bench(seen_by, found.adjustment)
     return [labels[k] for k in range(len(pictures))]
 
 
 def _first_label(
-    picture: MirrorDots, benches: Sequence[tuple[Rig, ImageCalibration]], freed: FloatArray
+    picture: MirrorDots, benches: Sequence[Bench], freed: FloatArray
 ) -> tuple[Labelled, Rig]:
     """Return the labels from the first bench that succeeds, and its rig.
 
     The alternatives are needed because a mirror of another kind or size than given, or a quantity
     that is far off, misleads the subsequent adjustments.
     """
-    for rig, calibration in benches[:-1]:
-        try:
-            return label_picture(picture, rig, calibration, freed), rig
-        except CannotMeasure:
-            continue
-    rig, calibration = benches[-1]
-    return label_picture(picture, rig, calibration, freed), rig
+    *others, last = benches
+    for bench in others:
+        with suppress(CannotMeasure):
+            return label_picture(picture, bench, freed), bench.rig
+    return label_picture(picture, last, freed), last.rig
 
 
 def _wide(rig: Rig) -> Rig:
@@ -302,15 +291,13 @@ def _wide(rig: Rig) -> Rig:
     return replace(rig, uncertainty=replace(rig.uncertainty, covariance=covariance))
 
 
-def adjusted_bench(
-    rig: Rig, made: Adjustment, checked: bool = False
-) -> tuple[Rig, ImageCalibration]:
+def adjusted_bench(rig: Rig, made: Adjustment, checked: bool = False) -> Bench:
     """Return the adjusted rig and image calibration, with their uncertainty."""
     after, calibration = moved_bench(rig, made.offset)
     assert after.uncertainty is not None
     assumed = frozenset() if checked else after.uncertainty.assumed
     known = replace(after.uncertainty, covariance=made.covariance, assumed=assumed, checked=checked)
-    return replace(after, uncertainty=known), calibration
+    return Bench(replace(after, uncertainty=known), calibration)
 
 
 REASONS: dict[ResidualVerdict, str] = {

@@ -146,10 +146,10 @@ def _misled(check: BenchCheck, k: int, error_mm: float, pool: Cap) -> float:
     at = system.parts[k + 1].start + wrong.mirror.parameters.index("height_mm")
     unknown[at] -= error_mm / wrong.mirror.sigma[at - system.parts[k + 1].start]
     again = system.adjustment(system.minimise(unknown, made.scale, MOST_ITERATIONS), made.scale)
-    rig, calibration = adjusted_bench(check.before, again)
+    misled = adjusted_bench(check.before, again)
     match = _expected_match(check.rig, pool)
-    seen = calibration.to_plane(check.calibration.to_image(match.plane_mm))
-    exact = [replace(one, uncertainty=None) for one in (check.rig, rig)]
+    seen = misled.calibration.to_plane(check.calibration.to_image(match.plane_mm))
+    exact = [replace(one, uncertainty=None) for one in (check.rig, misled.rig)]
     try:
         right, found = (
             measure_surface(fit.reconstruct(each, bench, FitSettings()), each, bench).height_mm

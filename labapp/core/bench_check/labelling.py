@@ -17,10 +17,8 @@ import scipy
 from labapp.core.bench_check.adjustment import Adjustment, Sighting, adjust
 from labapp.core.bench_check.mirrors import Mirror, landing_points
 from labapp.core.geometry.bench import Bench
-from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.optics import intersect_level
 from labapp.core.geometry.perturbation import moved_dots, moved_rig
-from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import QUANTITIES
 from labapp.core.images.dots import Dots
 from labapp.core.matching.observation import UNLABELLED, Observation
@@ -99,12 +97,7 @@ class Labelled:
     cost: float
 
 
-def label_picture(
-    picture: MirrorDots,
-    rig: Rig,
-    calibration: ImageCalibration,
-    freed: FloatArray | None = None,
-) -> Labelled:
+def label_picture(picture: MirrorDots, bench: Bench, freed: FloatArray | None = None) -> Labelled:
     """Assign a ray to every dot of a picture.
 
     Raises
@@ -114,8 +107,7 @@ def label_picture(
         ``ambiguous-rows`` if several can; ``no-match`` if the mirror does not explain the dots
         with any of them.
     """
-    pattern = rig.pattern
-    if pattern.marker is None:
+    if bench.rig.pattern.marker is None:
         raise CannotMeasure(
             "no-reference", "the pattern has no absent ray that would identify rows"
         )
@@ -124,7 +116,7 @@ def label_picture(
             "too-few-dots",
             f"{picture.name}: {len(picture.dots)} dots, a bench check needs {LEAST_DOTS}",
         )
-    observed = Observation.of(picture.dots, Bench(rig, calibration), picture.frame_shape)
+    observed = Observation.of(picture.dots, bench, picture.frame_shape)
     found: list[Labelled] = []
     for first in (_by_lattice, _by_places):
         starts = _likeliest(first(observed, picture), observed)

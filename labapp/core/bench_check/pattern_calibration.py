@@ -72,7 +72,7 @@ def calibrate_pattern(pictures: Sequence[MirrorDots], bench: Bench) -> PatternCa
     weight, weighted, squares = (np.zeros((*shape, 2)) for _ in range(3))
     seen = np.zeros(shape, np.int64)
     for picture in pictures:
-        labels = label_picture(picture, rig, bench.calibration).labels
+        labels = label_picture(picture, bench).labels
         observed = Observation.of(picture.dots, bench, picture.frame_shape)
         sighting = sighting_of(observed, picture.mirror, labels)
         tangents, sigma = _unfolded(bench, picture, sighting.plane_mm, sighting.covariance_mm2)

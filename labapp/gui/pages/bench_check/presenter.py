@@ -141,7 +141,7 @@ def check(
         rows, columns = one.image.shape
         pictures.append(MirrorDots(one.name, one.mirror, dots, (rows, columns)))
     progress(len(chosen), parts, "adjusting the set-up")
-    found = check_bench(pictures, setup.rig, setup.calibration, free)
+    found = check_bench(pictures, setup.bench, free)
     kept = []
     for n, (one, checked) in enumerate(zip(chosen, found.pictures, strict=True)):
         progress(len(chosen) + 1 + n, parts, f"measuring {one.mirror.name}")
