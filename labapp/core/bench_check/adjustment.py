@@ -9,7 +9,7 @@ quantity that is known exactly has no unknown.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -184,6 +184,16 @@ class System:
         root = known.root if freed is None else np.column_stack([known.root, freed.T])
         return cls(rig, tuple(sightings), root)
 
+    def with_free(self, direction: FloatArray) -> System:
+        """Return the equations with another direction freed, shape (q,), see `adjust`."""
+        return replace(self, factor=np.column_stack([self.factor, direction]))
+
+    def with_mirror(self, k: int, mirror: Mirror) -> System:
+        """Return the equations with another mirror in a sighting."""
+        sightings = list(self.sightings)
+        sightings[k] = replace(sightings[k], mirror=mirror)
+        return replace(self, sightings=tuple(sightings))
+
     @cached_property
     def parts(self) -> list[slice]:
         """Slices of the unknowns: of the bench, then of each pose."""
@@ -349,7 +359,13 @@ class System:
         """
         extra = self.size - len(made.unknown)
         unknown = np.insert(made.unknown, self.parts[0].stop - extra, np.zeros(extra))
-        return self.adjustment(self.minimise(unknown, made.scale, MOST_ITERATIONS), made.scale)
+        return self.refined(unknown, made.scale)
+
+    def refined(
+        self, unknown: FloatArray, scale: float, steps: int = MOST_ITERATIONS
+    ) -> Adjustment:
+        """Iterate from unknowns near the adjustment; the scale of the residuals is known."""
+        return self.adjustment(self.minimise(unknown, scale, steps), scale)
 
     def by_bench(self, made: Adjustment) -> FloatArray:
         """Derivatives of the residuals w.r.t. all quantities of the bench, shape (m, q)."""

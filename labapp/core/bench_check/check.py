@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.bench_check.adjustment import Adjustment, Sighting, adjust
+from labapp.core.bench_check.adjustment import Adjustment, Sighting, System, adjust
 from labapp.core.bench_check.known import MeasuredSize, measure_sizes
 from labapp.core.bench_check.labelling import (
     LEAST_DOTS,
@@ -183,11 +183,12 @@ def check_bench(
     freed = freed_directions(rig, free)
     observed = [Observation.of(p.dots, bench, p.frame_shape) for p in pictures]
     made, sightings, used = _adjusted(pictures, observed, bench, freed)
-    suspects = find_suspects(rig, sightings, made, freed)
+    system = System.of(rig, sightings, freed)
+    suspects = find_suspects(system, made)
     seen = [(o, p.mirror, own) for o, p, own in zip(observed, pictures, used, strict=True)]
-    slip = slip_cost_fall(rig, seen, made, freed)
-    verdict, patterns = judge(rig, sightings, made, freed)
-    sizes = measure_sizes(rig, sightings, freed, made)
+    slip = slip_cost_fall(system, seen, made)
+    verdict, patterns = judge(system, made)
+    sizes = measure_sizes(system, made)
     named = {
         f"{size.name} in {picture.name}": size
         for picture, own in zip(pictures, sizes, strict=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.bench_check.adjustment import MOST_ITERATIONS, Sighting, System
+from labapp.core.bench_check.adjustment import Sighting, System
 from labapp.core.bench_check.check import BenchCheck, adjusted_bench
 from labapp.core.bench_check.mirrors import Cap, Mirror, Plate, landing_points, placed
 from labapp.core.bench_check.suspects import freed_directions
@@ -138,15 +138,13 @@ def _misled(check: BenchCheck, k: int, error_mm: float, pool: Cap) -> float:
     """
     mirror = check.sightings[k].mirror
     raised = replace(mirror, height_mm=mirror.height_mm + error_mm)
-    wrong = replace(check.sightings[k], mirror=raised)
-    sightings = [wrong if n == k else one for n, one in enumerate(check.sightings)]
-    system = System.of(check.before, sightings, freed_directions(check.before, check.free))
+    freed = freed_directions(check.before, check.free)
+    system = System.of(check.before, check.sightings, freed).with_mirror(k, raised)
     made, unknown = check.adjustment, check.adjustment.unknown.copy()
     # The estimated pose is kept; it differs by the error from the pose expected now.
-    at = system.parts[k + 1].start + wrong.mirror.parameters.index("height_mm")
-    unknown[at] -= error_mm / wrong.mirror.sigma[at - system.parts[k + 1].start]
-    again = system.adjustment(system.minimise(unknown, made.scale, MOST_ITERATIONS), made.scale)
-    misled = adjusted_bench(check.before, again)
+    height = mirror.parameters.index("height_mm")
+    unknown[system.parts[k + 1].start + height] -= error_mm / mirror.sigma[height]
+    misled = adjusted_bench(check.before, system.refined(unknown, made.scale))
     match = _expected_match(check.rig, pool)
     seen = misled.calibration.to_plane(check.calibration.to_image(match.plane_mm))
     exact = [replace(one, uncertainty=None) for one in (check.rig, misled.rig)]

@@ -8,12 +8,13 @@ the result differs from the known size by more than their uncertainties allow, o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
-from labapp.core.bench_check.adjustment import MOST_ITERATIONS, Adjustment, Sighting, System, adjust
+from labapp.core.bench_check.adjustment import Adjustment, Sighting, System, adjust
 from labapp.core.bench_check.mirrors import Cap, Mirror, Plate, sphere_radius
 from labapp.core.geometry.perturbation import moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
@@ -74,31 +75,18 @@ class MeasuredSize:
         return abs(self.deviation) > CONTRADICTED
 
 
-def measure_sizes(
-    rig: Rig, sightings: Sequence[Sighting], freed: FloatArray, made: Adjustment
-) -> tuple[tuple[MeasuredSize, ...], ...]:
+def measure_sizes(system: System, made: Adjustment) -> tuple[tuple[MeasuredSize, ...], ...]:
     """Measure the sizes of each mirror: its height, preceded by the radius of a ball or cap."""
     every = []
-    for k, sighting in enumerate(sightings):
+    for k, sighting in enumerate(system.sightings):
         mirror = sighting.mirror
         known = mirror.pose, np.diag(mirror.sigma**2)
-        by_new = _by_adjusted_bench(rig, sighting, made)
-        independent = _without_size(rig, sightings, freed, made, k)
+        by_new = _by_adjusted_bench(system.rig, sighting, made)
+        independent = _without_size(system, made, k)
         sizes = []
         for name, size in _sizes(mirror).items():
-            known_mm, known_sigma = _propagated(size, *known)
-            measured_mm, sigma = _propagated(size, *by_new)
-            independent_mm, independent_sigma = _propagated(size, *independent)
-            one = MeasuredSize(
-                name=name,
-                known_mm=known_mm,
-                known_sigma_mm=known_sigma,
-                measured_mm=measured_mm,
-                sigma_mm=sigma,
-                independent_mm=independent_mm,
-                independent_sigma_mm=independent_sigma,
-            )
-            sizes.append(one)
+            pairs = (_propagated(size, *one) for one in (known, by_new, independent))
+            sizes.append(MeasuredSize(name, *chain.from_iterable(pairs)))
         every.append(tuple(sizes))
     return tuple(every)
 
@@ -116,19 +104,15 @@ def _by_adjusted_bench(
     return found.poses[0], found.pose_covariances[0]
 
 
-def _without_size(
-    rig: Rig, sightings: Sequence[Sighting], freed: FloatArray, made: Adjustment, k: int
-) -> tuple[FloatArray, FloatArray]:
+def _without_size(system: System, made: Adjustment, k: int) -> tuple[FloatArray, FloatArray]:
     """Pose of a mirror, and its covariance, by an adjustment in which its size is free."""
-    own = sightings[k].mirror
+    own = system.sightings[k].mirror
     loose = _loosened(own)
-    others = [replace(s, mirror=loose) if n == k else s for n, s in enumerate(sightings)]
-    system = System.of(rig, others, freed)
     # A part of the pose that is known exactly is no unknown: its uncertainty stays zero.
     narrower = np.divide(own.sigma, loose.sigma, out=np.ones_like(own.sigma), where=loose.sigma > 0)
     unknown = made.unknown.copy()
     unknown[system.parts[k + 1]] *= narrower
-    found = system.adjustment(system.minimise(unknown, made.scale, MOST_ITERATIONS), made.scale)
+    found = system.with_mirror(k, loose).refined(unknown, made.scale)
     return found.poses[k], found.pose_covariances[k]
 
 

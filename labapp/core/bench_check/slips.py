@@ -8,6 +8,7 @@ dots beyond the pattern's edge distinguish the two.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,9 +21,8 @@ from labapp.core.bench_check.labelling import (
     sighting_of,
 )
 from labapp.core.bench_check.mirrors import Mirror
-from labapp.core.geometry.rig import Rig
 from labapp.core.matching.observation import UNLABELLED, Observation
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.values import IntArray
 
 SLIPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 """Rows and columns by which rays may be off."""
@@ -34,12 +34,7 @@ Seen = tuple[Observation, Mirror, IntArray]
 """A picture's dots, its mirror, and the index of each ray's dot."""
 
 
-def slip_cost_fall(
-    rig: Rig,
-    seen: Sequence[Seen],
-    made: Adjustment,
-    freed: FloatArray,
-) -> float:
+def slip_cost_fall(system: System, seen: Sequence[Seen], made: Adjustment) -> float:
     """Reduction of the cost with the rays of the next row or column; −inf if there is none.
 
     Dots without a ray cost as in `label_picture`. An alternative is excluded at once if its
@@ -56,31 +51,25 @@ def slip_cost_fall(
     possible = [one for one in possible if min(map(_lit, one)) >= LEAST_DOTS]
     if not possible:
         return -np.inf
-    tried = [(_adjusted(rig, one, made.scale, freed), one) for one in possible]
+    tried = [(_adjusted(system, one, made.scale), one) for one in possible]
     near, best = min(tried, key=lambda pair: pair[0].cost + STRAY * _strays(pair[1]))
     again = [
         (observed, mirror, relabelled(observed, mirror, near.offset, pose))
         for (observed, mirror, _), pose in zip(best, near.poses, strict=True)
     ]
     best = again if min(map(_lit, again)) >= LEAST_DOTS else best
-    found = _adjusted(rig, best, made.scale, freed, near)
+    found = _adjusted(system, best, made.scale, near)
     return made.cost + STRAY * strays - found.cost - STRAY * _strays(best)
 
 
 def _adjusted(
-    rig: Rig,
-    seen: Sequence[Seen],
-    scale: float,
-    freed: FloatArray,
-    near: Adjustment | None = None,
+    system: System, seen: Sequence[Seen], scale: float, near: Adjustment | None = None
 ) -> Adjustment:
     """Adjust to labels, roughly or from a similar adjustment; the absent ray may have a dot."""
-    sightings = [
-        sighting_of(observed, mirror, labels, with_absent=True) for observed, mirror, labels in seen
-    ]
-    system = System.of(rig, sightings, freed)
-    start, steps = (system.start(), FEW_STEPS) if near is None else (near.unknown, STEPS)
-    return system.adjustment(system.minimise(start, scale, steps), scale)
+    sightings = (sighting_of(*one, with_absent=True) for one in seen)
+    slipped = replace(system, sightings=tuple(sightings))
+    start, steps = (slipped.start(), FEW_STEPS) if near is None else (near.unknown, STEPS)
+    return slipped.refined(start, scale, steps)
 
 
 def _lit(one: Seen) -> int:

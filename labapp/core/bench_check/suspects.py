@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.bench_check.adjustment import Adjustment, Sighting, System
+from labapp.core.bench_check.adjustment import Adjustment, System
 from labapp.core.geometry.perturbation import Direction, directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
@@ -78,16 +78,13 @@ def suspect_keys() -> tuple[str, ...]:
     return (*INDEX, "picture.u", "picture.v", "picture.scale")
 
 
-def find_suspects(
-    rig: Rig, sightings: Sequence[Sighting], made: Adjustment, freed: FloatArray
-) -> tuple[Suspect, ...]:
+def find_suspects(system: System, made: Adjustment) -> tuple[Suspect, ...]:
     """Find the quantities that reduce the cost most when freed, the likeliest first.
 
     Quantities that explain the dots equally well are returned together, as the pictures cannot
     distinguish them. Empty if none is suspected.
     """
-    every = {one.key: one for one in directions(rig)}
-    system = System.of(rig, sightings, freed)
+    every = {one.key: one for one in directions(system.rig)}
     by_bench = system.by_bench(made)
     first = {key: made.cost_fall(by_bench @ _free(one)[:, None])[0] for key, one in every.items()}
     most = max(first.values())
@@ -97,10 +94,8 @@ def find_suspects(
     likely = sorted(first, key=lambda key: -first[key])[:TRIED]
     found = []
     for key in likely:
-        system = System.of(rig, sightings, np.vstack([freed, _free(every[key])]))
-        found.append(
-            Suspect(key, every[key].name, made.cost - system.refitted_with_more_free(made).cost)
-        )
+        freed = system.with_free(_free(every[key])).refitted_with_more_free(made)
+        found.append(Suspect(key, every[key].name, made.cost - freed.cost))
     found.sort(key=lambda one: -one.cost_fall)
     if found[0].cost_fall < LIMIT:
         return ()

@@ -54,16 +54,13 @@ class ResidualPattern:
     rms_mm: float
 
 
-def judge(
-    rig: Rig, sightings: Sequence[Sighting], made: Adjustment, freed: FloatArray
-) -> tuple[ResidualVerdict, tuple[ResidualPattern, ...]]:
+def judge(system: System, made: Adjustment) -> tuple[ResidualVerdict, tuple[ResidualPattern, ...]]:
     """Classify the residuals of an adjustment: verdict, and patterns, the likeliest first."""
-    system = System.of(rig, sightings, freed)
     left = float(np.sum(made.weight * (made.standardised / made.scale) ** 2))
     size = np.sqrt(np.mean(np.concatenate([r.ravel() for r in made.residual_mm]) ** 2))
     unit = float(size / np.sqrt(np.mean(made.standardised**2)))
     found, sure = [], []
-    for cause, columns in _causes(rig, made, system):
+    for cause, columns in _causes(system, made):
         cost_fall, amplitudes = made.cost_fall(columns)
         pattern = ResidualPattern(
             cause, cost_fall, float(np.sqrt(np.mean((columns @ amplitudes) ** 2))) * unit
@@ -81,13 +78,11 @@ def judge(
     return ("unexplained" if made.scale > COARSE else "noise-like"), tuple(found)
 
 
-def _causes(
-    rig: Rig, made: Adjustment, system: System
-) -> Iterator[tuple[ResidualVerdict, FloatArray]]:
+def _causes(system: System, made: Adjustment) -> Iterator[tuple[ResidualVerdict, FloatArray]]:
     """Each cause, with the changes of the standardised residuals per amplitude, shape (m, c)."""
-    bench = moved_rig(rig, made.offset)
+    bench = moved_rig(system.rig, made.offset)
     every = list(enumerate(zip(system.sightings, made.poses, strict=True)))
-    bent = [system.by_dots(k, _bent_picture(s, rig)) for k, (s, _) in every]
+    bent = [system.by_dots(k, _bent_picture(s, system.rig)) for k, (s, _) in every]
     yield "distortion", np.sum(bent, axis=0)
     other = [system.by_dots(k, _other_lens(s, p, bench)) for k, (s, p) in every]
     yield "wrong-lens", np.sum(other, axis=0)
