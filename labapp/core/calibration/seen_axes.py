@@ -92,12 +92,17 @@ class SeenAxes:
         return np.array([[0.0, 0.0], [self.x_axis_mm, 0.0], [0.0, self.z_axis_mm]])
 
     def _scales_and_angle(self, points_px: FloatArray) -> FloatArray:
-        x_arm, z_arm = points_px[1:] - points_px[0]
-        turn = np.arctan2(-z_arm[1], z_arm[0]) - np.arctan2(-x_arm[1], x_arm[0])
-        return np.array(
-            [
-                np.hypot(*x_arm) / self.x_axis_mm,
-                np.hypot(*z_arm) / self.z_axis_mm,
-                np.degrees(turn) % 360.0,
-            ]
-        )
+        return scales_and_angle(points_px, self.x_axis_mm, self.z_axis_mm)
+
+
+def scales_and_angle(points_px: FloatArray, x_mm: float, z_mm: float) -> FloatArray:
+    """Scales along O′X′ and O′Z′, px/mm, and the angle between them, degrees, shape (3,).
+
+    Parameters
+    ----------
+    points_px, x_mm, z_mm
+        (u, v) of O′ and of a point on each axis, shape (3, 2), and their X′ and Z′.
+    """
+    x_arm, z_arm = points_px[1:] - points_px[0]
+    turn = np.arctan2(-z_arm[1], z_arm[0]) - np.arctan2(-x_arm[1], x_arm[0])
+    return np.array([np.hypot(*x_arm) / x_mm, np.hypot(*z_arm) / z_mm, np.degrees(turn) % 360.0])

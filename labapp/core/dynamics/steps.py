@@ -66,8 +66,6 @@ class StepResponse(ReadOnlyArrays):
 
     Parameters
     ----------
-    step_s
-        Time at which the driving signal changed.
     before
         Level of the series before the step.
     value, sigma
@@ -78,7 +76,6 @@ class StepResponse(ReadOnlyArrays):
         The model at the fitted samples, shape (2, n): time, s, and value.
     """
 
-    step_s: float
     before: float
     value: dict[str, float]
     sigma: dict[str, float]
@@ -182,7 +179,7 @@ def step_response(time_s: FloatArray, values: FloatArray, step_s: float) -> Step
     found = dict(zip(RESPONSE_QUANTITIES, quantities(best.x).tolist(), strict=True))
     known = dict(zip(RESPONSE_QUANTITIES, sigma.tolist(), strict=True))
     course = np.stack([time_s, model(best.x, time)])
-    return StepResponse(step_s, float(best.x[0]), found, known, order, course)
+    return StepResponse(float(best.x[0]), found, known, order, course)
 
 
 def _noise(level: FloatArray, lags: tuple[int, ...]) -> float:

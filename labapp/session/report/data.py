@@ -11,6 +11,7 @@ import numpy as np
 
 from labapp.config.settings import differences
 from labapp.config.setup import Setup
+from labapp.core.calibration.seen_axes import scales_and_angle
 from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.core.matching.row_shape import match_row_shapes
 from labapp.core.pipeline import Measurement, Settings
@@ -348,8 +349,9 @@ def rig_cells(setup: Setup, status: str = "") -> Cells:
     rig, plane = setup.rig, setup.rig.imaging_plane
     absent = ", ".join(f"({i}, {j})" for i, j in sorted(rig.pattern.absent_rays)[:8])
     x, y, z = plane.origin_mm
-    along_x, along_z, angle = _image_scale(setup)
-    origin = setup.calibration.to_image(np.zeros(2))
+    step = 1e-3
+    seen = setup.calibration.to_image(step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    origin, (along_x, along_z, angle) = seen[0], scales_and_angle(seen, step, step)
     return [
         ["part", "quantity", "value"],
         ["set-up", "status", status],
@@ -396,15 +398,6 @@ def _tilt_rows(plane: ImagingPlane) -> Cells:
         return [["", "pose", "vertical, square to Y"]]
     angles = ", ".join(f"{angle:.4g} °" for angle in plane.angles_deg)
     return [["", "pitch, yaw, roll", angles]]
-
-
-def _image_scale(setup: Setup) -> tuple[float, float, float]:
-    """Return the scales along O′X′ and O′Z′ at O′, px/mm, and the angle between them, degrees."""
-    step = 1e-3
-    seen = setup.calibration.to_image(step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
-    x_arm, z_arm = (seen[1:] - seen[0]) / step
-    turn = np.arctan2(-z_arm[1], z_arm[0]) - np.arctan2(-x_arm[1], x_arm[0])
-    return float(np.hypot(*x_arm)), float(np.hypot(*z_arm)), float(np.degrees(turn) % 360)
 
 
 def corrections_cells(session: SessionContents, frames: Sequence[int]) -> Cells:
