@@ -160,8 +160,6 @@ class Residuals(ReadOnlyArrays):
         match, made = measurement.match, measurement.reconstruction
         if match is None or made is None or not isinstance(made.unbounded, SplineSurface):
             return None
-        if len(made.residual_mm) != len(match.ray):
-            return None
         return cls(match.ray, made.residual_mm, made.unbounded)
 
 

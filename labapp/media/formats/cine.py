@@ -110,7 +110,7 @@ class CineSource(StoredFrames):
             raise InputError(path, "Compression", compression, A_CINE)
         self._format = _read_format(path, image_at, size)
         setup = _read_setup(path, setup_at, size)
-        self._places, claimed = _read_places(path, table_at, claimed, size, self._format)
+        self._places = _read_places(path, table_at, claimed, size, self._format)
         count = len(self._places)
         time_s = _read_times(path, setup_at + setup.length, table_at, claimed)
         warnings = [*ends_early(path.name, claimed, count)]
@@ -246,8 +246,8 @@ def _read_setup(path: Path, at: int, size: int) -> _Setup:
 
 def _read_places(
     path: Path, at: int, claimed: int, size: int, form: _Format
-) -> tuple[npt.NDArray[np.uint64], int]:
-    """Return the offset of every complete image, shape (n,), and the claimed number of images."""
+) -> npt.NDArray[np.uint64]:
+    """Return the offset of every complete image, shape (n,)."""
     if claimed == 0:
         raise InputError(path, "ImageCount", 0, "1 frame or more")
     possible = min(claimed, max(size - at, 0) // 8, size // (8 + form.image_bytes))
@@ -256,7 +256,7 @@ def _read_places(
     if not len(whole):
         raise InputError(path, "frames", "no complete one", A_CINE)
     # An invalid offset in the middle keeps its number; those after the last valid one are dropped.
-    return places[: whole[-1] + 1], claimed
+    return places[: whole[-1] + 1]
 
 
 def _read_times(path: Path, at: int, end: int, count: int) -> FloatArray | None:
