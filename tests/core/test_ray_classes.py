@@ -9,7 +9,10 @@ import pytest
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Laser, Rig
+from labapp.core.images.dots import Dots
 from labapp.core.matching.hypothesis import USUAL_FIT, paths_of
+from labapp.core.matching.match_rays import match_rays
+from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import (
     RESOLVED_SIZES,
     UNLABELLED,
@@ -17,7 +20,14 @@ from labapp.core.matching.observation import (
     try_fit,
     widened,
 )
-from labapp.core.matching.ray_classes import RayClasses, certain_states, classify_rays
+from labapp.core.matching.ray_classes import (
+    RayClasses,
+    certain_states,
+    classify_rays,
+    too_faint,
+)
+from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
+from labapp.core.surface.level import boundary_is_seen
 from labapp.core.values import BoolArray, FloatArray, IntArray
 from labapp.simulation.forward import trace
 from labapp.simulation.pools import egg, spherical_cap
@@ -164,16 +174,18 @@ def test_false_dot_beside_the_plane_does_not_widen_the_view(
     def exact(rays: IntArray) -> FloatArray:
         return np.zeros((len(rays), 2, 2))
 
-    certain, expected = (certain_states(one, found, paths, exact) for one in (with_false, cropped))
+    certain, expected = (
+        certain_states(one, labels, found, paths, exact) for one in (with_false, cropped)
+    )
     np.testing.assert_array_equal(certain, expected)
     # A labelled ray at the rim may leave the splines.
     plane = paths.plane_mm.copy()
     plane[np.flatnonzero(found > 0)[0]] = np.nan
-    beyond = certain_states(with_false, found, replace(paths, plane_mm=plane), exact)
+    beyond = certain_states(with_false, labels, found, replace(paths, plane_mm=plane), exact)
     np.testing.assert_array_equal(beyond, certain)
     # Rows and columns whose predictions are uncertain by 2 mm may have left the view as well.
     rough, expected = (
-        certain_states(one, found, paths, lambda rays: exact(rays) + 4 * np.eye(2))
+        certain_states(one, labels, found, paths, lambda rays: exact(rays) + 4 * np.eye(2))
         for one in (with_false, cropped)
     )
     np.testing.assert_array_equal(rough, expected)
@@ -231,3 +243,53 @@ def test_wide_dot_is_merged_from_those_of_the_rays_beside_it(
     # A false dot that is wide has no rays beside it.
     size_mm[pair[1]] = size_mm[pair[0]]
     assert classify_rays(replace(usual, size_mm=size_mm), others, paths).stray.tolist() == [pair[1]]
+
+
+ROW, COLUMN = np.indices((19, 19)) - 9
+DISC = ROW**2 + COLUMN**2 <= 5**2
+"""Rays of the pattern that have a dot in the tests of faint dots."""
+
+
+def faint_beside(over_limit: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Rays beside those of the disc, and those of them that are too faint, shape (rows, columns).
+
+    ``over_limit`` has the brightness of all rays, which scatters by 0.2 in addition.
+    """
+    labels = np.where(DISC, np.cumsum(DISC).reshape(DISC.shape) - 1, UNLABELLED)
+    scatter = np.random.default_rng(1).normal(0.0, 0.2, DISC.sum())
+    faint = too_faint(np.maximum(over_limit[DISC] + scatter, 0.0), labels)
+    beside = widened(DISC, 1) & ~DISC
+    assert not (faint & DISC).any()
+    return beside, faint & beside
+
+
+@pytest.mark.parametrize("brightness", [0.8, 1.5])
+def test_dots_that_do_not_fade_are_not_too_faint(brightness: float) -> None:
+    _, faint = faint_beside(np.full(DISC.shape, brightness))
+    assert not faint.any()
+
+
+def test_dots_that_fade_towards_the_rim_may_be_too_faint_beyond_it() -> None:
+    beside, faint = faint_beside(1.8 - (ROW**2 + COLUMN**2) / 14.0)
+    assert (faint == beside).all()
+
+
+def test_dots_that_fade_to_one_side_may_be_too_faint_there() -> None:
+    beside, faint = faint_beside(1.6 - COLUMN * 0.35)
+    assert faint[beside & (COLUMN > 4)].all()
+    assert not faint[beside & (COLUMN < 3)].any()
+
+
+def test_boundary_is_not_seen_where_dots_fade() -> None:
+    seen = see(spherical_cap(6.0, 0.25), np.random.default_rng(5), sigma_px=0.05)
+    r2 = ((seen.ray - 10) ** 2).sum(axis=1)
+    peak = 100.0 * np.exp(-r2 / (0.25 * r2.max()))
+    found = peak > 9.0  # about the limit of the detector
+    assert found.mean() < 0.9
+    fading = Dots(*(values[found] for values in vars(replace(seen.dots, peak=peak)).values()))
+    even = replace(fading, peak=np.full(len(fading), 100.0))
+    bench = Bench(BENCH_RIG, BENCH_VIEW)
+    lattice = find_lattice(fading, FRAME_SHAPE, LatticeSettings())
+    for dots, is_seen in ((even, True), (fading, False)):
+        match, _ = match_rays(dots, lattice, bench, FRAME_SHAPE, MatchSettings())
+        assert boundary_is_seen(match.ray_states) == is_seen

@@ -435,7 +435,7 @@ def match_of_hypothesis(
             observed.rig, surface.basis, inverse, paths.points_mm[rays], paths.plane_mm[rays]
         )
 
-    ray_states = certain_states(observed, best.ray_states, paths, covariance_of)
+    ray_states = certain_states(observed, best.labels, best.ray_states, paths, covariance_of)
     missed = best.missed_count
     return match_of_pairs(observed, at, dot, orientation, ray_states, missed, trials, marker_site)
 

@@ -19,6 +19,7 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.optics import ProjectedRays
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
+from labapp.core.images.visibility import over_limit
 from labapp.core.match import MatchedDots
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool, misfits
 from labapp.core.values import (
@@ -83,6 +84,9 @@ class Observation(ReadOnlyArrays):
         Height and width of the frame, px.
     hidden_rows
         Rows i of the pattern whose missing dots are hidden, as set by the operator.
+    over_limit
+        Logarithm of the brightness of each over that of the faintest dot that is found
+        (`images.visibility`), shape (n,). None: all dots are bright.
     """
 
     plane_mm: FloatArray
@@ -91,6 +95,7 @@ class Observation(ReadOnlyArrays):
     bench: Bench
     frame_shape: tuple[int, int]
     hidden_rows: frozenset[int] = frozenset()
+    over_limit: FloatArray | None = None
 
     @classmethod
     def of(cls, dots: Dots, bench: Bench, frame_shape: tuple[int, int]) -> Observation:
@@ -102,7 +107,8 @@ class Observation(ReadOnlyArrays):
         plane, covariance, scale = band_pass_kernels.on_plane(
             bench.calibration.matrix, image_px, sigma
         )
-        return cls(plane, covariance, dots.size_px * scale, bench, frame_shape)
+        size_mm = dots.size_px * scale
+        return cls(plane, covariance, size_mm, bench, frame_shape, over_limit=over_limit(dots))
 
     @cached_property
     def resolution_mm(self) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from labapp.core.matching.observation import UNLABELLED, Observation, widened
 from labapp.core.matching.prediction import RayPaths
@@ -23,6 +24,21 @@ dots it is 0.1 to 0.3 mm, beyond the last visible row of a pool that is steep th
 NEAR_EDGE_MM = 8.0
 """Dots predicted within this distance of the edge of the view may be out of it. The uncertainty of
 predictions is computed only there."""
+
+
+FAINT_SIGMA, NEAR_LIMIT = 1.0, 0.5
+"""A dot may be too faint to be found if its brightness, as extrapolated from the others, is less
+than so many σ above the limit of the detector. Dots do not fade out where the logarithm of the
+brightness of each, over this limit, exceeds the second."""
+
+MOST_FAINT = 0.25
+"""If more of the dark rays beside lit ones may have such dots, no ray is known to be dark: the few
+others would not show the boundary. In 48 frames whose dots do not fade, no such ray was found."""
+
+FADING, SCATTER, LEAST_SCATTER, SCATTER_ROUNDS = 1.0, 0.3, 0.1, 3
+"""Expected size of each term of the quadratic by which the logarithm of the brightness changes
+from the middle of the labelled rays outwards; scatter from dot to dot at first, and at least; and
+the number of rounds in which the scatter is found."""
 
 
 @dataclass(frozen=True)
@@ -71,19 +87,23 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
 
 def certain_states(
     observed: Observation,
+    labels: IntArray,
     ray_states: IntArray,
     paths: RayPaths,
     covariance_of: Callable[[IntArray], FloatArray],
 ) -> IntArray:
-    """Return the states of rays, with dark rays set to unknown if their dots may be out of view.
+    """Return the states of rays, with dark rays set to unknown if their dots may not be visible.
 
-    Beyond the last visible row the fit extrapolates smoothly, whereas the pool gets steeper towards
-    its edge: the dots of the next row may lie farther out than predicted.
+    They may be out of view: beyond the last visible row the fit extrapolates smoothly, whereas the
+    pool gets steeper towards its edge, so that the dots of the next row may lie farther out than
+    predicted. Or they may be too faint (`too_faint`).
 
     Parameters
     ----------
     observed, paths
         The frame's dots, and the ray paths for the surface.
+    labels
+        Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
     ray_states
         Those of `classify_rays`.
     covariance_of
@@ -104,7 +124,54 @@ def certain_states(
         # In an extrapolated row, those that are predicted out of view count as well.
         for some in (beyond & dark, beyond & rough):
             certain.flat[near[some][_in_lines(near[some], ray_states.shape[1])]] = 0
+    if observed.over_limit is not None:
+        faint, beside = too_faint(observed.over_limit, labels), (certain < 0) & widened(lit, 1)
+        if np.count_nonzero(faint & beside) > MOST_FAINT * np.count_nonzero(beside):
+            faint[:] = True
+        certain[faint & (certain < 0)] = 0
     return certain
+
+
+def too_faint(over_limit: FloatArray, labels: IntArray) -> BoolArray:
+    """Mask of the rays whose dots may be too faint to be found, shape (rows, columns).
+
+    Where dots become fainter towards the rim, as under the profile of the laser's beam or in a
+    vignette, the last ones are not found, and their rays seem to have missed the pool: caps were
+    measured 30 % too low, by 14 σ. The logarithm of the brightness of the labelled dots is
+    therefore fitted by a quadratic of row and column, and extrapolated by one ray: to the place
+    beside the nearest labelled ray, on the way to the other.
+
+    Parameters
+    ----------
+    over_limit
+        See `Observation`, shape (n,).
+    labels
+        Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
+    """
+    lit, faint = labels != UNLABELLED, np.zeros(labels.shape, bool)
+    bright = over_limit[labels[lit]]
+    if lit.all() or bright.min() > NEAR_LIMIT:
+        return faint
+    labelled, other = np.argwhere(lit).astype(float), np.argwhere(~lit).astype(float)
+    nearest = labelled[scipy.spatial.cKDTree(labelled).query(other)[1]]
+    way = other - nearest
+    beside = nearest + way / np.abs(way).max(axis=1, keepdims=True)
+    middle, radius = labelled.mean(axis=0), float(np.sqrt(2.0) * labelled.std()) + 1.0
+    known, asked = (_quadratic((place - middle) / radius) for place in (labelled, beside))
+    prior, variance = np.diag([0.0] + 5 * [1 / FADING**2]), SCATTER**2
+    for _ in range(SCATTER_ROUNDS):
+        normal = known.T @ known / variance + prior
+        fitted = np.linalg.solve(normal, known.T @ bright / variance)
+        variance = max(float(np.mean((bright - known @ fitted) ** 2)), LEAST_SCATTER**2)
+    doubt = variance + np.einsum("ni,ni->n", asked @ np.linalg.inv(normal), asked)
+    faint[~lit] = asked @ fitted < FAINT_SIGMA * np.sqrt(doubt)
+    return faint
+
+
+def _quadratic(place: FloatArray) -> FloatArray:
+    """Terms of a quadratic at places, shape (n, 2): shape (n, 6)."""
+    i, j = place.T
+    return np.stack([np.ones(len(i)), i, j, i * i, i * j, j * j], axis=1)
 
 
 def _in_lines(rays: IntArray, columns: int) -> BoolArray:

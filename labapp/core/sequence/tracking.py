@@ -403,7 +403,8 @@ def _with_level(
     """Classify the rays, and shift the surface to the level that follows from the known ones."""
     observed, paths = fit.observed, fit.paths()
     found = classify_rays(observed, fit.labels, paths)
-    ray_states = certain_states(observed, found.ray_states, paths, lambda some: covariance[some])
+    states, labels = found.ray_states, fit.labels
+    ray_states = certain_states(observed, labels, states, paths, lambda some: covariance[some])
     if prior.drop_is_free:
         # A missing dot at the rim would be taken for a lower rear. In other frames such rays count
         # as dark: where the rim moves, they tell how far.
