@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
+from labapp.core.images.peaks import DetectorTuning
 from labapp.core.matching import decision
 from labapp.core.matching.checks import unexplained
 from labapp.core.matching.decision import decide
@@ -17,6 +18,8 @@ from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.matching.relabelling import shifted_labels
 from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
+from labapp.core.sequence.prior import Prior
+from labapp.core.sequence.tracking import track
 from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, IntArray
 from labapp.simulation.forward import trace
@@ -119,6 +122,23 @@ def test_rays_of_a_row_that_may_be_out_of_view_are_not_dark() -> None:
     row, columns = 12, slice(8, 12)
     assert hit[row, columns].all()
     assert (match.ray_states[row, columns] == 0).all()
+
+
+def test_dots_in_doubt_are_not_exchanged_in_the_next_frame() -> None:
+    """A narrow dip: the surface through the other dots predicts the crossed ones exchanged."""
+    rng = np.random.default_rng(40)
+    dip = Dent(rng.uniform(0.004, 0.02), rng.uniform(0.25, 0.5), tuple(rng.uniform(-1.2, 1.2, 2)))
+    pool = egg(7.0, 3.5, 4.0, rng.uniform(0.07, 0.15), (0.0, 0.0), (dip,))
+    seen, bench = see(pool, rng, sigma_px=0.06), Bench(BENCH_RIG, BENCH_VIEW)
+    match = matched(seen)
+    fitted = fit.fit_surface(match, BENCH_RIG, FitSettings())
+    found = fit.bound_and_measure(match, fitted, BENCH_RIG)
+    tuning = DetectorTuning(2.0, np.ones(FRAME_SHAPE, np.float32), 1.0, 1.0)
+    prior = Prior.of(bench, tuning, match, fitted, *found)
+    observed, _ = observation_of(seen)
+    followed = track(prior, observed, MatchSettings()).match
+    assert (seen.ray[followed.dot] == followed.ray).all()
+    assert len(followed.dot) >= 0.9 * len(seen.ray)
 
 
 @pytest.mark.slow

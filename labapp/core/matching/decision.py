@@ -118,12 +118,15 @@ def decide(
     _refuse_marker(observed, best, found)
     doubtful: list[int] = []
     rivals: list[tuple[IntArray, float]] = []
-    mirrored = (
+    for labels in exchanged_labels(observed, best.labels):
+        exchanged = evaluate_averaged(observed, labels, fit_settings, best.pool)
+        if exchanged is not None and _may_be_exchanged(best, exchanged, settings):
+            doubtful += _differing(best, exchanged)[0]
+    others = (
         reoriented_labels(observed, best.labels, orientation, other)
         for other in settings.orientations
         if other != orientation
     )
-    others = (*mirrored, *exchanged_labels(observed, best.labels))
     for other in [*found, *neighbours, *_rivals(observed, best, others, fit_settings)]:
         if _clearly_cheaper(observed, cheapest, other, fit_settings, settings):
             continue
@@ -394,6 +397,17 @@ def _clearly_cheaper(
     if ahead and own[1] < own[0] + margin:
         return True
     return bool((rival >= own).all() and (rival >= own + margin).any())
+
+
+def _may_be_exchanged(best: Hypothesis, other: Hypothesis, settings: MatchSettings) -> bool:
+    """Whether labels with two dots exchanged explain as much, with a surface not much rougher.
+
+    A narrow dip is rougher than expected: with its rows crossed the wrong surface cost 26 less.
+    """
+    ahead = other.cost - best.cost
+    return ahead < settings.margin or (
+        ahead < FAR_AHEAD and other.misfit < best.misfit + settings.margin
+    )
 
 
 def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> bool:

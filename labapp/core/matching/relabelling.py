@@ -19,8 +19,8 @@ AGREED = 0.8
 """Minimum share of the labelled dots in the lattice that must have the same offset of rays
 from sites."""
 
-CLOSE_TOGETHER = 0.4
-"""Dots of adjacent rays are exchanged if they are closer together than this share of the median
+CLOSE_TOGETHER = 0.6
+"""Dots of adjacent rays are close together if they are nearer than this share of the median
 distance of such dots in the frame. Elsewhere an exchange bends the surface too much."""
 
 
@@ -90,18 +90,24 @@ def exchanged_labels(observed: Observation, labels: IntArray) -> Iterator[IntArr
 
     Where rows cross in a dip, two exchanged labels support each other.
     """
+    for one, other in close_pairs(observed, labels):
+        exchanged = labels.copy()
+        exchanged[one], exchanged[other] = labels[other], labels[one]
+        yield exchanged
+
+
+def close_pairs(observed: Observation, labels: IntArray) -> Iterator[tuple[Site, Site]]:
+    """Yield pairs of adjacent rays, counted from 0, whose dots are close together."""
     lit, plane_mm = labels != UNLABELLED, np.full((*labels.shape, 2), np.nan)
     plane_mm[lit] = observed.plane_mm[labels[lit]]
-    for axis in (0, 1):
+    for axis, step in enumerate(((1, 0), (0, 1))):
         apart_mm = np.linalg.norm(np.diff(plane_mm, axis=axis), axis=-1)
         both = np.isfinite(apart_mm)
         if not both.any():
             continue
-        for at in np.argwhere(both & (apart_mm < CLOSE_TOGETHER * median(apart_mm[both]))):
-            one, other = tuple(at), tuple(at + np.eye(2, dtype=int)[axis])
-            exchanged = labels.copy()
-            exchanged[one], exchanged[other] = labels[other], labels[one]
-            yield exchanged
+        close = both & (apart_mm < CLOSE_TOGETHER * median(apart_mm[both]))
+        for i, j in np.argwhere(close).tolist():
+            yield (i, j), (i + step[0], j + step[1])
 
 
 def _labels_of_pairs(ray: IntArray, dot: IntArray, shape: tuple[int, ...]) -> IntArray:

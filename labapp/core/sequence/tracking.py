@@ -27,6 +27,7 @@ from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, amid, count_labels, widened
 from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_states, classify_rays
+from labapp.core.matching.relabelling import close_pairs
 from labapp.core.schemes import LEAST_DOTS
 from labapp.core.schemes.fit import UNSETTLED_MM, is_too_smooth
 from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Prior, Tracked, predictions
@@ -369,7 +370,14 @@ def _extended_labels(fit: _Fit) -> IntArray:
         ray = near[ray]
         may = beside.ravel()[ray] & (next_mm[ray] > observed.resolution_mm) & is_free[dot]
         labels[ray[may]] = dot[may]
-    return labels.reshape(lit.shape)
+    labels = labels.reshape(lit.shape)
+    # In doubt before: the surface through the others may predict two crossed rays exchanged.
+    doubtful = amid(fit.prior.lit) & ~fit.prior.lit & (labels != UNLABELLED)
+    if np.count_nonzero(doubtful) > 1:
+        for one, other in list(close_pairs(observed, labels)):
+            if doubtful[one] and doubtful[other]:
+                labels[one] = labels[other] = UNLABELLED
+    return labels
 
 
 def _apart_mm(one: FloatArray, other: FloatArray) -> FloatArray:
