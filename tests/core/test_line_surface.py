@@ -127,6 +127,41 @@ def test_uncertainties_include_pools_of_other_widths(pool: Pool, status: str | N
     assert abs(fitted.width_mm - np.ptp(points[:, 0])) < 2.5 * fitted.width_sigma_mm
 
 
+@pytest.mark.slow
+def test_uncertainties_include_the_error_of_the_expected_smoothness():
+    """The heights at both ends of each line are no better known than the width."""
+    height, width = 0.4, 7.2
+    frame = rendered(egg(width, 3.2, 3.6, height, (0.4, 0.0)))  # wider than the fan on one side
+    data, numbers = exact_data(frame)
+    fitted = fit_lines(data, [numbers], RIG)
+    assert fitted.status == "ok"
+    assert fitted.width_sigma_mm > 0.09 * width
+    ends = np.concatenate([one.point_mm[[0, -1]] for one in frame.lines])
+    slope = 4 * height / width  # of a parabola at its ends
+    assert (fitted.sigma_mm(*ends[:, :2].T) > 0.3 * slope * 0.1 * width).all()
+
+
+@pytest.mark.slow
+def test_width_of_a_pool_as_wide_as_the_fan_has_an_uncertainty():
+    """Whether its lines end with the fan or on the boundary is not certain."""
+    data, numbers = exact_data(rendered(spherical_cap(9.0, 0.3)), sigma_mm=0.02)
+    fitted = fit_lines(data, [numbers], RIG)
+    assert fitted.width_mm > 7.5
+    assert fitted.width_sigma_mm > 0.3
+
+
+@pytest.mark.slow
+def test_fit_of_a_small_pool_settles():
+    """It takes more steps than that of a large one; before, it was 16 % too high."""
+    frame = rendered(egg(4.5, 1.395, 2.25, 0.23))
+    data, _ = exact_data(frame, sigma_mm=0.02)
+    either = [np.array([1.0, 2, 3, 4]), np.array([2.0, 3, 4, 5])]
+    fitted = fit_lines(data, either, RIG)
+    assert fitted.status == "ok"
+    height = np.concatenate([one.point_mm for one in frame.lines])[:, 2].max()
+    assert fitted.height_mm == pytest.approx(height, rel=0.05)
+
+
 def first_lines(data: LineData, count: int) -> LineData:
     """Return the data of the lowest lines."""
     on, ends = data.line < count, data.end_line < count

@@ -84,7 +84,8 @@ class Linearized(ReadOnlyArrays):
         Intersection of the surface with the ray nearest to each point and end, (n + m, 3), mm.
     aside
         Derivatives of the x of these intersections w.r.t. the coefficients, (n + m, p): the ray
-        nearest to a point is another one on another surface.
+        nearest to a point is another one on another surface. At an end of the fan they are as if
+        the fan went on, since the line may as well end on the boundary beside it.
     """
 
     residual: FloatArray
@@ -128,12 +129,12 @@ class LineModel:
         place = np.concatenate([data.plane_mm, data.end_mm])
         number = self.numbers[line]
         fan = nearest_on_curves(curves, line, place)
-        rate, _ = self._rates(coefficients, number, fan)
-        point, direction, slope = self._meet(coefficients, number, fan)
-        plane = self._land(point, direction, slope)
-        # One Newton step from the nearest point of the polyline to that of the curve.
-        ahead = np.vecdot(rate, place - plane) / np.maximum(np.vecdot(rate, rate), 1e-6)
+        plane = self._land(*self._meet(coefficients, number, fan))
+        # One step along the polyline from its nearest point to that of the curve.
         step = curves.fan[1] - curves.fan[0]
+        piece = np.clip((fan - curves.fan[0]) / step, 0, len(curves.fan) - 2).astype(int)
+        rate = np.nan_to_num(np.diff(curves.plane_mm, axis=1)[line, piece] / step)
+        ahead = np.vecdot(rate, place - plane) / np.maximum(np.vecdot(rate, rate), 1e-6)
         fan = np.clip(fan + np.clip(ahead, -step, step), curves.fan[0], curves.fan[-1])
         point, direction, slope = self._meet(coefficients, number, fan)
         plane = self._land(point, direction, slope)
@@ -157,7 +158,7 @@ class LineModel:
         descent = np.minimum(direction[:, 2] - np.vecdot(slope, direction[:, :2]), -0.05)
         rises = (direction[:, 2] / descent)[:, None] * value
         inside = np.abs(fan) < curves.fan[-1] - 1e-6
-        turn = np.where(inside, -1.0, 0.0) / np.maximum(np.vecdot(rate, rate), 1e-6)
+        turn = -1.0 / np.maximum(np.vecdot(rate, rate), 1e-6)
         aside = (move[:, 0] * turn)[:, None] * (rate[:, :, None] * change).sum(axis=1)
         aside += (direction[:, 0] / descent)[:, None] * value
         ends = slice(count, None)

@@ -21,7 +21,8 @@ class LineSurface(ReadOnlyArrays):
         The surface, z = 0 at the boundary.
     covariance
         Covariance of its coefficients, shape (p, p), mm². It includes the differences from the
-        surfaces of other widths that agree as well with the lines.
+        surfaces of other widths that agree as well with the lines, and the error of the width from
+        the expected smoothness (`fit.WIDTH_ERROR`).
     numbers
         Number of each line in the pattern, from the lowest in the picture up, shape (k,).
     point_mm
