@@ -400,7 +400,7 @@ def _with_width_error(covariance: FloatArray, ends: FloatArray, error_mm: float)
     """
     along = covariance @ ends.T
     change = error_mm / np.sqrt(2) * np.linalg.solve(ends @ along, along.T)
-    return covariance + change.T @ change
+    return np.asarray(covariance + change.T @ change)
 
 
 def _misfit(linear: Linearized) -> float:
