@@ -285,11 +285,18 @@ def test_rows_as_likely_without_the_dot_in_their_hole_are_a_rival() -> None:
     assert result.status == "ambiguous-rows"
 
 
-@pytest.mark.parametrize("seed", [14, 33, 406])
+@pytest.mark.parametrize("seed", [14, 406])
 def test_rows_ambiguous_because_of_a_second_hole_are_rejected(seed: int) -> None:
     """Dots beside the marker are missing; in 406 a false dot lies on it: once a row off."""
     got, _ = rendered.measured("dented", seed)
     assert got.status in {"ambiguous-rows", "no-reference", "no-match"}
+
+
+def test_rows_whose_dots_merge_beside_the_marker_are_found() -> None:
+    """Three dots are wide: without the rays of which they are merged, too many were unexplained."""
+    got, _ = rendered.measured("dented", 33)
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.9 * got.shown
 
 
 @pytest.mark.slow
