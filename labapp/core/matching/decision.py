@@ -116,12 +116,8 @@ def decide(
     refuse_unexplained(observed, best, settings, most_scattered)
     orientation = best.orientation(observed)
     _refuse_marker(observed, best, found)
-    doubtful: list[int] = []
+    doubtful = _exchangeable(observed, best, fit_settings, settings.margin)
     rivals: list[tuple[IntArray, float]] = []
-    for labels in exchanged_labels(observed, best.labels):
-        exchanged = evaluate_averaged(observed, labels, fit_settings, best.pool)
-        if exchanged is not None and _may_be_exchanged(best, exchanged, settings):
-            doubtful += _differing(best, exchanged)[0]
     others = (
         reoriented_labels(observed, best.labels, orientation, other)
         for other in settings.orientations
@@ -399,15 +395,26 @@ def _clearly_cheaper(
     return bool((rival >= own).all() and (rival >= own + margin).any())
 
 
-def _may_be_exchanged(best: Hypothesis, other: Hypothesis, settings: MatchSettings) -> bool:
-    """Whether labels with two dots exchanged explain as much, with a surface not much rougher.
+def _exchangeable(
+    observed: Observation, best: Hypothesis, fit_settings: FitSettings, margin: float
+) -> list[int]:
+    """Dots that explain as much if two are exchanged, with a surface that is not much rougher.
 
     A narrow dip is rougher than expected: with its rows crossed the wrong surface cost 26 less.
     """
-    ahead = other.cost - best.cost
-    return ahead < settings.margin or (
-        ahead < FAR_AHEAD and other.misfit < best.misfit + settings.margin
-    )
+    dots: list[int] = []
+    rough = try_fit(observed, best.labels, initial=best.pool)
+    most = -np.inf if rough is None else rough_costs(observed, best.labels, rough)[1] + FAR_AHEAD
+    for labels in exchanged_labels(observed, best.labels):
+        pool = try_fit(observed, labels, initial=best.pool)
+        if pool is None or rough_costs(observed, labels, pool)[1] > most:
+            continue
+        other = evaluate_averaged(observed, labels, fit_settings, pool)
+        if other is None or other.cost > best.cost + FAR_AHEAD:
+            continue
+        if min(other.cost - best.cost, other.misfit - best.misfit) < margin:
+            dots += labels[labels != best.labels].tolist()
+    return dots
 
 
 def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> bool:

@@ -19,7 +19,7 @@ AGREED = 0.8
 """Minimum share of the labelled dots in the lattice that must have the same offset of rays
 from sites."""
 
-CLOSE_TOGETHER = 0.6
+CLOSE_TOGETHER = 0.45
 """Dots of adjacent rays are close together if they are nearer than this share of the median
 distance of such dots in the frame. Elsewhere an exchange bends the surface too much."""
 
