@@ -15,8 +15,8 @@ import numpy as np
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import ORIENTATIONS, Match, Orientation, signs_of
-from labapp.core.matching.row_shape import ALLOWED, match_row_shapes
 from labapp.core.schemes.irs import Algorithm, IrsSettings, estimates
+from labapp.core.schemes.row_shape import ALLOWED, match_row_shapes
 from labapp.core.schemes.slopes import Estimate, ReflectedRays, reflected_rays
 from labapp.core.surface.measures import inside_points
 from labapp.core.values import CannotMeasure

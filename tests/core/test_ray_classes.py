@@ -10,6 +10,7 @@ import pytest
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Laser, Rig
 from labapp.core.images.dots import Dots
+from labapp.core.images.visibility import over_limit
 from labapp.core.matching.hypothesis import USUAL_FIT, paths_of
 from labapp.core.matching.match_rays import match_rays
 from labapp.core.matching.match_settings import MatchSettings
@@ -20,7 +21,9 @@ from labapp.core.matching.observation import (
     try_fit,
     widened,
 )
+from labapp.core.matching.prediction import RayPaths
 from labapp.core.matching.ray_classes import (
+    NEAR_LIMIT,
     RayClasses,
     certain_states,
     classify_rays,
@@ -42,11 +45,16 @@ def observed_on(rig: Rig) -> tuple[Observation, IntArray]:
     return Observation.of(SEEN.dots, Bench(rig, BENCH_VIEW), FRAME_SHAPE), true_labels(SEEN)
 
 
+def paths_for(observed: Observation, labels: IntArray) -> RayPaths:
+    """Return the paths of the rays for the surface fitted to labels."""
+    pool = try_fit(observed, labels, USUAL_FIT)
+    assert pool is not None
+    return paths_of(observed, pool)
+
+
 def classes(observed: Observation, labels: IntArray) -> RayClasses:
     """Return the classes of rays for the surface fitted to the true labels."""
-    pool = try_fit(observed, true_labels(SEEN), USUAL_FIT)
-    assert pool is not None
-    return classify_rays(observed, labels, paths_of(observed, pool))
+    return classify_rays(observed, labels, paths_for(observed, true_labels(SEEN)))
 
 
 def inner(lit: BoolArray) -> BoolArray:
@@ -153,9 +161,7 @@ def test_false_dot_beside_the_plane_does_not_widen_the_view(
     frame: tuple[Observation, IntArray],
 ) -> None:
     observed, labels = frame
-    pool = try_fit(observed, labels, USUAL_FIT)
-    assert pool is not None
-    paths = paths_of(observed, pool)
+    paths = paths_for(observed, labels)
     ray_states = classify_rays(observed, labels, paths).ray_states
     dark = np.flatnonzero((ray_states < 0) & widened(ray_states > 0, 1))
     right = paths.plane_mm[dark, 0].max()
@@ -221,9 +227,7 @@ def test_wide_dot_is_merged_from_those_of_the_rays_beside_it(
     frame: tuple[Observation, IntArray],
 ) -> None:
     observed, labels = frame
-    pool = try_fit(observed, labels, USUAL_FIT)
-    assert pool is not None
-    paths = paths_of(observed, pool)
+    paths = paths_for(observed, labels)
     ray = np.argwhere(inner(labels != UNLABELLED))[0]
     pair = np.array([labels[tuple(ray)], labels[ray[0], ray[1] + 1]])
     half_apart_mm = np.diff(observed.plane_mm[pair], axis=0)[0] / 2
@@ -250,17 +254,26 @@ DISC = ROW**2 + COLUMN**2 <= 5**2
 """Rays of the pattern that have a dot in the tests of faint dots."""
 
 
-def faint_beside(over_limit: FloatArray) -> tuple[BoolArray, BoolArray]:
+def faint_beside(brightness: FloatArray) -> tuple[BoolArray, BoolArray]:
     """Rays beside those of the disc, and those of them that are too faint, shape (rows, columns).
 
-    ``over_limit`` has the brightness of all rays, which scatters by 0.2 in addition.
+    ``brightness`` is that of all rays, which scatters by 0.2 in addition.
     """
     labels = np.where(DISC, np.cumsum(DISC).reshape(DISC.shape) - 1, UNLABELLED)
     scatter = np.random.default_rng(1).normal(0.0, 0.2, DISC.sum())
-    faint = too_faint(np.maximum(over_limit[DISC] + scatter, 0.0), labels)
+    faint = too_faint(np.maximum(brightness[DISC] + scatter, 0.0), labels)
     beside = widened(DISC, 1) & ~DISC
     assert not (faint & DISC).any()
     return beside, faint & beside
+
+
+def test_dots_entered_where_no_light_is_do_not_count_as_faint() -> None:
+    """Their peak is 0, and so is their signal-to-noise ratio."""
+    peak = np.where(np.arange(len(SEEN.dots)) < 5, 0.0, 100.0)
+    over = over_limit(replace(SEEN.dots, peak=peak, snr=peak))
+    assert np.isnan(over[:5]).all()
+    assert (over[5:] > NEAR_LIMIT).all()
+    assert not too_faint(over, true_labels(SEEN)).any()
 
 
 @pytest.mark.parametrize("brightness", [0.8, 1.5])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from labapp.core.matching.row_shape import RowShapes, match_row_shapes, row_shapes
+from labapp.core.schemes.row_shape import RowShapes, match_row_shapes, row_shapes
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import spherical_cap
 from labapp.studies.correspondence_table import (

@@ -27,7 +27,7 @@ from labapp.export.frame_result import FrameResult
 from labapp.export.results import surface_files
 from labapp.export.tables import csv_rows, frame_tables
 from labapp.media import open_source
-from labapp.session.corrections_csv import read_correction
+from labapp.session.corrections.csv_file import read_correction
 from labapp.session.file.blobs import fingerprint
 from labapp.session.file.schema import MEASURES
 from labapp.session.record import Record

@@ -11,7 +11,7 @@ from labapp.core.images.dots import Dots
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.lattice import Lattice
 from labapp.errors import InputError
-from labapp.session.corrections_csv import MOST_DOTS, read_correction
+from labapp.session.corrections.csv_file import MOST_DOTS, read_correction
 
 SHAPE = (100, 200)
 HEAD = "u_px,v_px,reflected_row,reflected_column"

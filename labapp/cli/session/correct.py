@@ -201,7 +201,7 @@ def _apply(
 ) -> Correction:
     """Apply one edit; ValueError if it does not fit."""
     from labapp.core.rows import correction as core
-    from labapp.session.corrections_csv import read_correction
+    from labapp.session.corrections.csv_file import read_correction
 
     if name == "dots":
         recording = session.recording
@@ -275,7 +275,7 @@ def _dot_at(correction: Correction, u_px: float, v_px: float) -> int:
 
 def _carried_on(session: Session, frame: int, correction: Correction) -> dict[int, Correction]:
     """Apply a correction to the frames after it while it fits, and report where it ends."""
-    from labapp.session.carrying_on import carried_on
+    from labapp.session.corrections.carrying_on import carried_on
 
     carried, words = carried_on(session, frame, correction)
     replaced = [number for number in carried if session.correction(number) is not None]

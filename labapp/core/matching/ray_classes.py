@@ -149,10 +149,12 @@ def too_faint(over_limit: FloatArray, labels: IntArray) -> BoolArray:
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
     """
     lit, faint = labels != UNLABELLED, np.zeros(labels.shape, bool)
-    bright = over_limit[labels[lit]]
-    if lit.all() or bright.min() > NEAR_LIMIT:
+    bright, labelled = over_limit[labels[lit]], np.argwhere(lit).astype(float)
+    seen = np.isfinite(bright)
+    bright, labelled = bright[seen], labelled[seen]
+    if lit.all() or not seen.any() or bright.min() > NEAR_LIMIT:
         return faint
-    labelled, other = np.argwhere(lit).astype(float), np.argwhere(~lit).astype(float)
+    other = np.argwhere(~lit).astype(float)
     nearest = labelled[scipy.spatial.cKDTree(labelled).query(other)[1]]
     way = other - nearest
     beside = nearest + way / np.abs(way).max(axis=1, keepdims=True)

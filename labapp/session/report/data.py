@@ -13,8 +13,8 @@ from labapp.config.settings import differences
 from labapp.config.setup import Setup
 from labapp.core.calibration.seen_axes import scales_and_angle
 from labapp.core.geometry.rig import ImagingPlane, Rig
-from labapp.core.matching.row_shape import match_row_shapes
 from labapp.core.pipeline import Measurement, Settings
+from labapp.core.schemes.row_shape import match_row_shapes
 from labapp.core.sequence.mean import series_of, sigma_of_mean
 from labapp.core.surface.measures import SIZES, Measures, sigma_name
 from labapp.core.values import FloatArray

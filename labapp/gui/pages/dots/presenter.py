@@ -20,7 +20,7 @@ from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
 from labapp.gui.tasks import Cancelled, Control
-from labapp.session.carrying_on import carried_on
+from labapp.session.corrections.carrying_on import carried_on
 from labapp.session.results.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
 from labapp.text import SIGMA_OF, plain, pluralize

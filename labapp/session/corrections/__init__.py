@@ -1,0 +1,1 @@
+"""Corrections by hand: from a file, and carried on to later frames."""
