@@ -25,6 +25,7 @@ from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, POINTS, QUANTITIES
 from labapp.errors import InputError
 from labapp.studies.adviser.bench_limits import BenchLimits
 from labapp.studies.adviser.expected_pools import ExpectedPools
+from labapp.studies.adviser.search import MOVED
 from labapp.studies.parameter_deviation import NOMINAL
 
 A_REQUEST = "a file for labapp advise (TOML, UTF-8)"
@@ -98,7 +99,12 @@ TABLES: dict[str, dict[str, Rule]] = {
 }
 """All tables and keys; only the pools are required."""
 
-RANGES = {"projection_angle_deg": "angle_deg", "plane_distance_mm": "plane_mm"}
+NAMES = {
+    "projection_angle_deg": "angle_deg",
+    "plane_distance_mm": "plane_mm",
+    "electrode_height_mm": "electrode_mm",
+}
+"""Fields of `BenchLimits` by the keys of ``[bench]`` that have another name."""
 
 
 def read_request(path: Path) -> dict[str, Any]:
@@ -155,20 +161,15 @@ def parse_request(
 
 
 def _limits(tables: dict[str, dict[str, Any]]) -> BenchLimits:
-    bench = dict(tables["bench"])
-    given: dict[str, Any] = {}
-    plate = (bench.pop("width_mm", 101.6), bench.pop("height_mm", 101.6))
-    electrode = bench.pop("electrode_height_mm", 5.0)
-    edge = bench.pop("edge_mm", 1.0)
-    for key, value in bench.items():
-        given[RANGES.get(key, key)] = _span(value)
-    calibration = tables["calibration"]
+    bench, calibration = dict(tables["bench"]), tables["calibration"]
+    width, height = BenchLimits.plate_mm
+    plate = bench.pop("width_mm", width), bench.pop("height_mm", height)
+    given = {NAMES.get(key, key): value for key, value in bench.items()}
+    given |= {name: _span(given[name]) for name in MOVED.values() if name in given}
     sigma = {key: float(calibration.get(name, NOMINAL[key])) for name, key in CALIBRATION.items()}
     return BenchLimits(
         **given,
         plate_mm=plate,
-        edge_mm=edge,
-        electrode_mm=electrode,
         pattern=dot_pattern(tables["pattern"]),
         sigma=sigma,
         angle_distance_correlation=calibration.get("angle_distance_correlation", 0.0),

@@ -25,7 +25,7 @@ from labapp.studies.adviser.bench_limits import (
     Place,
     broken,
 )
-from labapp.studies.adviser.expected_pools import ExpectedPools, Range, Sample
+from labapp.studies.adviser.expected_pools import ExpectedPools, Sample
 from labapp.studies.adviser.height_error import (
     Trial,
     predicted_errors,
@@ -344,7 +344,7 @@ def _refined_locally(
 
 def _swept(task: tuple[ExpectedPools, BenchLimits, Candidate, str, Sample, int]) -> Sweep:
     expected, limits, best, name, sample, count = task
-    low, high = spans(limits)[name]
+    low, high = getattr(limits, MOVED[name])
     values = np.unique(np.append(np.linspace(low, high, count), getattr(best.place, name)))
     margins, errors = [], []
     trial = Trial(limits, best.place, sample, 0, len(sample.pools))
@@ -363,11 +363,6 @@ def _swept(task: tuple[ExpectedPools, BenchLimits, Candidate, str, Sample, int])
     # The open bench's wider plate has its axis points farther out: only ratios are taken from it.
     ratio = np.array(errors) / errors[int(np.argmin(np.abs(values - getattr(best.place, name))))]
     return Sweep(name, values, best.error_mm * ratio, tuple(margins))
-
-
-def spans(limits: BenchLimits) -> dict[str, Range]:
-    """The range of each quantity of a `Place`."""
-    return {name: getattr(limits, field) for name, field in MOVED.items()}
 
 
 def constraint_text(name: Constraint, margin: float) -> str:
