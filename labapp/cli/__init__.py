@@ -29,7 +29,7 @@ from labapp.cli.shared import (
     INTERRUPTED,
     TERMINATED,
     Commands,
-    loaded_commands,
+    lazy_commands,
 )
 from labapp.cli.simulation import advise, benchmark, simulate
 from labapp.cli.window import asks_for_app, open_app
@@ -91,7 +91,7 @@ app = typer.Typer(
 )
 for name, (module, about) in GROUPS.items():
     app.add_typer(
-        typer.Typer(), name=name, cls=loaded_commands(module), help=about, no_args_is_help=True
+        typer.Typer(), name=name, cls=lazy_commands(module), help=about, no_args_is_help=True
     )
 app.command()(simulate.simulate)
 app.command()(advise.advise)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from labapp.cli.shared import NOTHING_MEASURED, finite, note, progress_bar
+from labapp.cli.shared import NOTHING_MEASURED, finite, print_above, progress_bar
 from labapp.errors import InputError
 from labapp.text import pluralize
 
@@ -149,7 +149,7 @@ def _film(
 
     with progress_bar() as bar:
         task = bar.add_task(camera, total=None)
-        log = logged(lambda event: note(bar.console, str(event)))
+        log = logged(lambda event: print_above(bar, str(event)))
 
         def say(event: Event) -> None:
             log(event)
@@ -173,7 +173,7 @@ def _film(
                         time.sleep(POLL_S)
                         bar.update(task, completed=take.frames)
                 except KeyboardInterrupt:
-                    note(bar.console, "stopped: the recording ends here")
+                    print_above(bar, "stopped: the recording ends here")
                 finally:
                     recorders.clear()
             return take

@@ -15,7 +15,7 @@ from labapp.cli.shared import (
     FrameRange,
     Recording,
     finite,
-    note,
+    print_above,
     progress_bar,
     warned,
     writable_folder,
@@ -121,13 +121,13 @@ def _measured(
         def shown(result: FrameResult) -> None:
             progress.advance(task)
             if result.measurement.lines is None:
-                note(progress.console, f"frame {result.frame}: {result.measurement.reason}")
+                print_above(progress, f"frame {result.frame}: {result.measurement.reason}")
 
         try:
             for _ in run(frames, measurer, [done.append, shown]):
                 pass
         except KeyboardInterrupt:
-            note(progress.console, f"stopped: {len(done)} of {len(frames)} frames are finished")
+            print_above(progress, f"stopped: {len(done)} of {len(frames)} frames are finished")
     return done
 
 

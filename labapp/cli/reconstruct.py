@@ -29,7 +29,7 @@ from labapp.cli.shared import (
     SchemeName,
     SigmaParts,
     Warm,
-    note,
+    print_above,
     progress_bar,
     progress_sink,
     warned,
@@ -106,10 +106,10 @@ def reconstruct(
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
     check_algorithm(settings, "--algorithm")
     settings = with_methods(settings, detector, rows)
-    places = {"lines": lines, "opcua": opcua}
+    addresses = {"lines": lines, "opcua": opcua}
     with ExitStack() as at_end:
         predictor = at_end.enter_context(_predicting(model, out)) if model is not None else None
-        more_sinks = _stream_sinks(at_end, places, anywhere, predictor)
+        more_sinks = _stream_sinks(at_end, addresses, anywhere, predictor)
         summary = _measure_recording(
             *(source, setup, out, settings, frames),
             surfaces=surfaces == "all",
@@ -137,14 +137,14 @@ def _predicting(model: Path, out: Path) -> Iterator[Predictor]:
 
 
 def _stream_sinks(
-    at_end: ExitStack, places: dict[str, str | None], anywhere: bool, predictor: Predictor | None
+    at_end: ExitStack, addresses: dict[str, str | None], anywhere: bool, predictor: Predictor | None
 ) -> list[Sink]:
     """Return a sink for the predictor and one for each stream with an address (`open_stream`).
 
     Streams are closed by ``at_end``.
     """
     sinks: list[Sink] = [] if predictor is None else [predictor.add]
-    requested = {kind: place for kind, place in places.items() if place is not None}
+    requested = {kind: address for kind, address in addresses.items() if address is not None}
     if not requested:
         return sinks
     from labapp.run.streams import open_stream, stream_values
@@ -153,8 +153,8 @@ def _stream_sinks(
         more = predictor.values if predictor is not None else dict
         return lambda result: stream.publish({**stream_values(result), **more()})
 
-    for kind, place in requested.items():
-        stream = open_stream(kind, place, anywhere)
+    for kind, address in requested.items():
+        stream = open_stream(kind, address, anywhere)
         at_end.callback(stream.close)
         typer.echo(f"Measures are sent from {stream.address}", err=True)
         sinks.append(sink(stream))
@@ -189,12 +189,12 @@ def _measure_recording(
     summary, record = Summary(), ResidualRecord(setup.rig)
     with open_source(source_path) as source, progress_bar() as progress:
         for warning in source.warnings:
-            note(progress.console, f"warning: {warning}")
+            print_above(progress, f"warning: {warning}")
         setup.require_size(source.shape, str(source_path))
         selected = select_frames(frames, len(source))
         origin = provenance(source, source_path, setup_path, setup, settings, selected, warm)
         results = ResultsWriter(out, setup.calibration, origin, surfaces, sigma_parts)
-        shown = progress_sink(progress, source.name, len(selected))
+        show_progress = progress_sink(progress, source.name, len(selected))
         try:
             with results, ExitStack() as at_end:
                 measurer: Measurer = ColdMeasurer(source.frame, setup, settings)
@@ -208,14 +208,14 @@ def _measure_recording(
                         sigma_parts=sigma_parts,
                         pools=at_end.enter_context(stretch_pools(len(selected))),
                     )
-                sinks = [results.write, summary.add, *more_sinks, shown]
+                sinks = [results.write, summary.add, *more_sinks, show_progress]
                 for _ in run(selected, with_setup_check(measurer, record), sinks):
                     pass
                 summary.verdict = record.verdict()
                 results.set_setup_status(judged_status(setup.rig, summary.verdict), summary.verdict)
         except KeyboardInterrupt:
             done = f"stopped: {results.frames} of {len(selected)} frames are done, in {out}"
-            note(progress.console, done)
+            print_above(progress, done)
             raise typer.Exit(INTERRUPTED) from None
     typer.echo(summary.text())
     typer.echo(f"Results are in {out.absolute()}")

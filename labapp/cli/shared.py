@@ -23,7 +23,6 @@ from labapp.system import quoted
 from labapp.text import pluralize
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.progress import Progress, TaskID
 
     from labapp.config.setup import Setup
@@ -101,24 +100,23 @@ KINDS_OF_VALUE = {
 }
 
 
-def reject_empty_path(parameter: Any, ctx: Any, value: Any) -> None:
-    """Raise `typer.BadParameter` for an empty path, which would mean the current folder."""
+@contextmanager
+def _values_in_errors(parameter: Any, ctx: Any, value: object) -> Iterator[None]:
+    """Name the value in errors about what it should be, which otherwise have only the latter.
+
+    An empty path, which would mean the current folder, is an error.
+    """
     given = value if isinstance(value, list | tuple) else [value]
     if parameter.type_descriptor.annotation is Path and "" in given:
         raise typer.BadParameter("the path is empty; . is the current folder", ctx, parameter)
-
-
-@contextmanager
-def _values_in_errors(value: object) -> Iterator[None]:
-    """Name the value in errors about what it should be, which otherwise have only the latter."""
     try:
         yield
     except typer.BadParameter as error:
         message = error.message.removeprefix("Value error, ")
         if message != (expected := message.removeprefix("Input should be ")):
-            given = " ".join(map(str, value)) if isinstance(value, list | tuple) else value
             number = "a number " if expected.startswith(("greater", "less")) else ""
-            message = f"{given}; expected {number}{expected.partition(', unable')[0]}"
+            shown = " ".join(map(str, given))
+            message = f"{shown}; expected {number}{expected.partition(', unable')[0]}"
         error.message = message
         raise
 
@@ -128,8 +126,7 @@ class Argument(typer.core.TyperArgument):
 
     def process_value(self, ctx: Any, value: Any) -> Any:
         """Convert the text of the command line."""
-        reject_empty_path(self, ctx, value)
-        with _values_in_errors(value):
+        with _values_in_errors(self, ctx, value):
             return super().process_value(ctx, value)
 
     @property
@@ -153,8 +150,7 @@ class Option(typer.core.TyperOption):
 
     def process_value(self, ctx: Any, value: Any) -> Any:
         """Convert the text of the command line."""
-        reject_empty_path(self, ctx, value)
-        with _values_in_errors(value):
+        with _values_in_errors(self, ctx, value):
             return super().process_value(ctx, value)
 
     def display_type(self, ctx: Any) -> str:
@@ -187,7 +183,7 @@ def command_group() -> typer.Typer:
     return typer.Typer(cls=Commands, rich_markup_mode=None)
 
 
-def loaded_commands(module: str) -> type[Commands]:
+def lazy_commands(module: str) -> type[Commands]:
     """Return a class of group whose commands are those of a module, loaded when they are needed.
 
     Most of the time that the command line needs to start goes into commands that are not run.
@@ -232,9 +228,9 @@ def progress_bar() -> Progress:
     )
 
 
-def note(console: Console, text: str) -> None:
+def print_above(progress: Progress, text: str) -> None:
     """Print a line on stderr, above the progress bar."""
-    console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
+    progress.console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
 
 
 def warned(setup: Setup) -> Setup:
@@ -253,12 +249,12 @@ def progress_sink(progress: Progress, name: str, count: int) -> Sink:
         measurement = result.measurement
         if is_failed(measurement.status):
             why = f"{measurement.status}: {measurement.reason}"
-            note(progress.console, f"frame {result.frame}: {why}")
+            print_above(progress, f"frame {result.frame}: {why}")
 
     return show
 
 
-def command(name: str, file: Path) -> str:
+def session_command(name: str, file: Path) -> str:
     """Return the shell command line of a session command, the file name quoted."""
     return f"labapp session {name} {quoted(str(file))}"
 
@@ -314,14 +310,14 @@ def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = Fals
                 pass
         except KeyboardInterrupt:
             done = f"stopped: {len(summary.frames)} of {len(frames)} frames are done and kept"
-            note(progress.console, f"{done}; the others: {command('measure', session.path)}")
+            print_above(progress, f"{done}; the others: {session_command('measure', session.path)}")
             raise typer.Exit(INTERRUPTED) from None
         except InputError:
             if len(summary.frames) == len(frames):  # the error is about unreadable frames
                 typer.echo(summary.text())
             elif summary.frames:
                 done = f"stopped: {len(summary.frames)} of {len(frames)} frames are done and kept"
-                note(progress.console, done)
+                print_above(progress, done)
             raise
     return summary
 
@@ -334,7 +330,7 @@ def report_stale_results(session: Session) -> Iterator[None]:
     after = _stale(session)
     if newly_stale := after - before:
         typer.echo(f"Now stale: {_results(newly_stale)}; to measure again:")
-        typer.echo(f"  {command('measure', session.path)}")
+        typer.echo(f"  {session_command('measure', session.path)}")
     if valid_again := before - after:
         typer.echo(f"No longer stale: {_results(valid_again)}")
 
@@ -428,5 +424,5 @@ def progress_shown(
         try:
             yield show
         except KeyboardInterrupt:
-            note(bar.console, stopped)
+            print_above(bar, stopped)
             raise typer.Exit(INTERRUPTED) from None

@@ -12,7 +12,7 @@ from labapp.cli.shared import (
     INTERRUPTED,
     NOTHING_MEASURED,
     command_group,
-    note,
+    print_above,
     progress_bar,
 )
 from labapp.system import quoted
@@ -93,13 +93,13 @@ def run(
 
         def noting(text: str) -> None:
             noted.add(text)
-            note(bar.console, text)
+            print_above(bar, text)
 
         try:
             opened.run(workers, scheduler, surfaces=surfaces, progress=show, note=noting)
         except KeyboardInterrupt:
             counts = count_states(opened.status(surfaces=surfaces))
-            note(bar.console, f"stopped: {counts}; what was measured is kept: run it again")
+            print_above(bar, f"stopped: {counts}; what was measured is kept: run it again")
             raise typer.Exit(INTERRUPTED) from None
     _finish(opened, surfaces, noted)
 

@@ -163,10 +163,10 @@ def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str
     """
     cells = [np.array([cell], object if isinstance(cell, str) else None) for cell in _cells(result)]
     measures = dict(zip(_NAMES["measures"], cells, strict=True))
-    return _tables_of_places(result, calibration) | {"measures": measures}
+    return _point_tables(result, calibration) | {"measures": measures}
 
 
-def _tables_of_places(result: FrameResult, calibration: ImageCalibration) -> dict[str, Columns]:
+def _point_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str, Columns]:
     """Return the tables of a frame that have a row for each dot or point."""
     measurement = result.measurement
     reconstruction = measurement.reconstruction
@@ -268,7 +268,7 @@ def table_rows(
     result: FrameResult, calibration: ImageCalibration, sigma_parts: bool = False
 ) -> dict[str, str]:
     """Return a frame's rows of every table as CSV text (`frame_tables`)."""
-    tables = _tables_of_places(result, calibration)
+    tables = _point_tables(result, calibration)
     rows = {name: csv_rows(name, table, sigma_parts) for name, table in tables.items()}
     row = [
         as_cell(cell) if column.digits is None else number(cell, column.digits)

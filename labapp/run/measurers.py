@@ -120,8 +120,8 @@ def _with_rows_voted(
     waiting: deque[tuple[FrameResult, Ballot]] = deque()
 
     def is_due() -> bool:
-        first, voters = waiting[0][1], sum(ballot.at is not None for _, ballot in waiting)
-        if first.at is None and not first.is_open:
+        first, voters = waiting[0][1], sum(ballot.shift is not None for _, ballot in waiting)
+        if first.shift is None and not first.is_open:
             return True
         most = MOST_WAITING_FOR_OPEN if first.is_open else MOST_WAITING
         return voters >= VOTERS or len(waiting) > most
@@ -242,15 +242,15 @@ class WarmMeasurer:
                 raise
             yield read
 
-    def _chain(self) -> WarmChain | _ChainElsewhere:
+    def _chain(self) -> WarmChain | _ChainInProcess:
         from labapp.core.recording.chain import WarmChain
 
         if self.pool is None:
             return WarmChain(self.setup.bench, self.settings)
-        return _ChainElsewhere(self.pool, self.setup, self.settings)
+        return _ChainInProcess(self.pool, self.setup, self.settings)
 
 
-class _ChainElsewhere:
+class _ChainInProcess:
     """A `WarmChain` in another process."""
 
     def __init__(self, pool: Executor, setup: Setup, settings: Settings) -> None:

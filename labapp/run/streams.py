@@ -291,7 +291,7 @@ class OpcuaStream:
                 await asyncio.sleep(OPCUA_S)
 
 
-def open_stream(kind: str, place: str, anywhere: bool) -> Stream:
+def open_stream(kind: str, address: str, anywhere: bool) -> Stream:
     """Open a stream by its kind, ``lines`` or ``opcua``, at ``PORT`` or ``HOST:PORT``.
 
     Raises
@@ -299,9 +299,9 @@ def open_stream(kind: str, place: str, anywhere: bool) -> Stream:
     InputError
         If the address has another form, or the port cannot be opened.
     """
-    host, _, port = place.rpartition(":")
+    host, _, port = address.rpartition(":")
     if not (port.isdecimal() and int(port) < 65536):
-        raise InputError("stream", kind, place, "PORT or HOST:PORT, a port from 0 to 65535")
+        raise InputError("stream", kind, address, "PORT or HOST:PORT, a port from 0 to 65535")
     at = (host.strip("[]") or "127.0.0.1", int(port), anywhere)
     return LineStream(*at) if kind == "lines" else OpcuaStream(*at)
 

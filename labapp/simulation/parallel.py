@@ -157,20 +157,20 @@ class InlineExecutor(Executor):
 
 
 def worker_pool(
-    workers: int, nice: int = 0, become: Callable[..., None] | None = None, *given: object
+    workers: int, nice: int = 0, initializer: Callable[..., None] | None = None, *given: object
 ) -> ProcessPoolExecutor:
     """Return a pool of worker processes, each begun by `start_worker`."""
     spawn = multiprocessing.get_context("spawn")
-    begin = functools.partial(start_worker, nice, become, *given)
+    begin = functools.partial(start_worker, nice, initializer, *given)
     return ProcessPoolExecutor(workers, spawn, initializer=begin)
 
 
 @contextmanager
 def processes(
-    workers: int, become: Callable[..., None] | None = None, *given: object
+    workers: int, initializer: Callable[..., None] | None = None, *given: object
 ) -> Iterator[ProcessPoolExecutor]:
-    """Pool of worker processes that call ``become(*given)`` first; an exception ends them."""
-    pool = worker_pool(workers, NICE if _low.get() else 0, become, *given)
+    """Pool of worker processes that call ``initializer(*given)`` first; an exception ends them."""
+    pool = worker_pool(workers, NICE if _low.get() else 0, initializer, *given)
     try:
         yield pool
     except BaseException:
@@ -191,8 +191,10 @@ def end_processes(pool: ProcessPoolExecutor, wait: bool = True) -> None:
     pool.shutdown(wait, cancel_futures=True)
 
 
-def start_worker(nice: int = 0, become: Callable[..., None] | None = None, *given: object) -> None:
-    """Initialise a worker process: it calls ``become(*given)``, if any, such as `hold`.
+def start_worker(
+    nice: int = 0, initializer: Callable[..., None] | None = None, *given: object
+) -> None:
+    """Initialise a worker process: it calls ``initializer(*given)``, if any, such as `hold`.
 
     The niceness is raised by ``nice``, the process computes in one thread, and it ends when its
     parent ends, even if that is killed. There is no clean-up when it ends: functions registered
@@ -211,8 +213,8 @@ def start_worker(nice: int = 0, become: Callable[..., None] | None = None, *give
 
     threading.Thread(target=follow, name="parent", daemon=True).start()
     atexit.register(os._exit, 0)  # unloading the libraries would take half a second
-    if become is not None:
-        become(*given)
+    if initializer is not None:
+        initializer(*given)
 
 
 _held: Any = None

@@ -172,7 +172,7 @@ def test_tracked_frames_share_the_rows_of_the_first() -> None:
     measured = [slipped(each, (1, 0)) if 3 <= k < 7 else each for k, each in enumerate(right)]
     vote = RowVote(BENCH_RIG, SETTINGS)
     ballots = [vote.add(each, tracked=k in {4, 5, 6}) for k, each in enumerate(measured)]
-    assert [each.at for each in ballots] == [*[(0, 0)] * 3, *[(1, 0)] * 4, (0, 0)]
+    assert [each.shift for each in ballots] == [*[(0, 0)] * 3, *[(1, 0)] * 4, (0, 0)]
     judged = [vote.judged(each).status for each in ballots]
     assert judged == [*["ok"] * 3, *["ambiguous-rows"] * 4, "ok"]
 
@@ -185,5 +185,5 @@ def test_frames_after_a_corrected_one_do_not_follow_it() -> None:
     measured = [*right[:3], corrected, *right[4:]]
     vote = RowVote(BENCH_RIG, SETTINGS)
     ballots = [vote.add(each, tracked=k > 3) for k, each in enumerate(measured)]
-    assert [each.at for each in ballots] == [*[(0, 0)] * 3, (1, 0), *[(0, 0)] * 2]
+    assert [each.shift for each in ballots] == [*[(0, 0)] * 3, (1, 0), *[(0, 0)] * 2]
     assert [vote.judged(each).status for each in ballots] == ["ok"] * 6

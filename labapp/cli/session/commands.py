@@ -32,13 +32,13 @@ from labapp.cli.shared import (
     SigmaParts,
     Warm,
     choose_frames,
-    command,
     command_group,
     finite,
     frames_text,
     measure_frames,
     progress_shown,
     report_stale_results,
+    session_command,
     warned,
 )
 from labapp.core.schemes import scheme_words
@@ -134,8 +134,8 @@ def new(
             session.set_setup(text)
         typer.echo(f"{session.path} is made")
     if text is None:
-        typer.echo(f"It has no set-up yet:\n  {command('setup', file)} SETUP.toml")
-    typer.echo(f"Import a recording:\n  {command('import', file)} RECORDING")
+        typer.echo(f"It has no set-up yet:\n  {session_command('setup', file)} SETUP.toml")
+    typer.echo(f"Import a recording:\n  {session_command('import', file)} RECORDING")
 
 
 @app.command("setup")
@@ -198,8 +198,10 @@ def import_recording(
         typer.echo(f"seeking    {exact}")
         typer.echo(f"kept       {'in the session itself' if embed else f'as {found.path}'}")
         if session.setup_problems:
-            typer.echo(f"The set-up is not complete:\n  {command('setup', file)} SETUP.toml")
-        typer.echo(f"Measure it:\n  {command('measure', file)}")
+            typer.echo(
+                f"The set-up is not complete:\n  {session_command('setup', file)} SETUP.toml"
+            )
+        typer.echo(f"Measure it:\n  {session_command('measure', file)}")
 
 
 INEXACT = (
@@ -455,8 +457,8 @@ def verify(
             typer.echo(printable(problem))
         if problems:
             typer.echo(
-                f"What helps\n  a missing recording: {command('relink', file)} RECORDING\n"
-                f"  a damaged result of frame N: {command('measure', file)} --frames N\n"
+                f"What helps\n  a missing recording: {session_command('relink', file)} RECORDING\n"
+                f"  a damaged result of frame N: {session_command('measure', file)} --frames N\n"
                 "  anything else: a copy from before, or export --frames of what can be read",
                 err=True,
             )

@@ -51,7 +51,7 @@ class Ballot:
 
     Parameters
     ----------
-    at
+    shift
         Shift of its rays from those of the first frame, in rows and columns; None without a
         surface.
     after
@@ -59,7 +59,7 @@ class Ballot:
     """
 
     measured: Measurement
-    at: tuple[int, int] | None = None
+    shift: tuple[int, int] | None = None
     after: Placed | None = None
 
     @property
@@ -76,7 +76,7 @@ class RowVote:
         self._places = project_rays(rig.laser, rig.pattern).landing_mm[..., :2].reshape(-1, 2)
         self._votes: Counter[tuple[int, int]] = Counter()
         """Number of frames by the shift of their rays from the first frame, in rows and columns."""
-        self._at = (0, 0)
+        self._shift = (0, 0)
         """Shift of the frames that are currently tracked."""
         self._usual: Placed | None = None
         """The last frame that agrees with the majority."""
@@ -95,7 +95,7 @@ class RowVote:
         A tracked frame has the rows of the previous one, and no vote of its own. A frame that was
         corrected by hand has a vote, but later frames are not tracked from it.
         """
-        surface, at = measured.reconstruction, self._at
+        surface, shift = measured.reconstruction, self._shift
         if surface is None:
             ballot = Ballot(measured)
             self._undecided += [ballot] if ballot.is_open else []
@@ -104,16 +104,16 @@ class RowVote:
             if self._usual is not None:
                 usual, (row, column) = self._usual
                 slip = self._slip(measured, usual)
-                at = row + int(slip[0]), column + int(slip[1])
+                shift = row + int(slip[0]), column + int(slip[1])
             if measured.correction is None:
-                self._at = at
-            self._votes[at] += 1
-        if self._votes[at] == max(self._votes.values(), default=0):
-            self._usual = surface, at
+                self._shift = shift
+            self._votes[shift] += 1
+        if self._votes[shift] == max(self._votes.values(), default=0):
+            self._usual = surface, shift
         for each in self._undecided:
-            each.after = surface, at
+            each.after = surface, shift
         self._undecided = []
-        return Ballot(measured, at)
+        return Ballot(measured, shift)
 
     def judged(self, ballot: Ballot) -> Measurement:
         """Return the measurement of an added frame, decided or rejected by the vote.
@@ -121,16 +121,16 @@ class RowVote:
         Without a majority for its rows it is ``ambiguous-rows``, unless an operator has set them.
         Frames must be judged in order.
         """
-        measured, at = ballot.measured, ballot.at
+        measured, shift = ballot.measured, ballot.shift
         if isinstance(measured, OpenMeasurement):
             self._undecided = [each for each in self._undecided if each is not ballot]
             return self._decide(measured, ballot.after)
-        if at is None:
+        if shift is None:
             return measured
-        agree, of = self._votes[at], self._votes.total()
-        if measured.correction is not None or self._has_majority(at):
+        agree, of = self._votes[shift], self._votes.total()
+        if measured.correction is not None or self._has_majority(shift):
             assert measured.reconstruction is not None
-            self._before = measured.reconstruction, at
+            self._before = measured.reconstruction, shift
             return measured
         reason = f"{of - agree} of {of} frames measured by themselves have their rows elsewhere"
         rejected = replace(measured, match=None, reconstruction=None, measures=None)
@@ -139,10 +139,10 @@ class RowVote:
     @property
     def is_outvoted(self) -> bool:
         """Whether the frames that are currently tracked have no majority for their rows."""
-        return bool(self._votes) and not self._has_majority(self._at)
+        return bool(self._votes) and not self._has_majority(self._shift)
 
-    def _has_majority(self, at: tuple[int, int]) -> bool:
-        return 2 * self._votes[at] > self._votes.total()
+    def _has_majority(self, shift: tuple[int, int]) -> bool:
+        return 2 * self._votes[shift] > self._votes.total()
 
     def _decide(self, measured: OpenMeasurement, after: Placed | None) -> Measurement:
         """Measure an open frame with the rows of the adjacent frames, or refuse it.
@@ -153,29 +153,31 @@ class RowVote:
         have moved by a row.
         """
         beside = [one for one in (self._before, after) if one is not None]
-        places = {at for _, at in beside}
-        if len(places) != 1:
+        shifts = {shift for _, shift in beside}
+        if len(shifts) != 1:
             return measured.refused
         index = self._alike(measured.candidates, [surface for surface, _ in beside])
         if index is None:
             return measured.refused
-        (at,) = places
+        (shift,) = shifts
         chosen, margin = measured.candidates[index], self._settings.match.margin
-        lost = self._lost.setdefault(at, {})
-        self._decided[at] += 1
+        lost = self._lost.setdefault(shift, {})
+        self._decided[shift] += 1
         for each in measured.candidates:
             if each is not chosen:
                 step = each.step[0] - chosen.step[0], each.step[1] - chosen.step[1]
                 less = max(1 - (each.cost - chosen.cost) / margin, 0.0)
                 lost[step] = lost.get(step, 0.0) + less
-        sure = self._votes[at] + self._decided[at] - max(lost.values(), default=0.0)
+        sure = self._votes[shift] + self._decided[shift] - max(lost.values(), default=0.0)
         is_likeliest = chosen.cost <= min(each.cost for each in measured.candidates)
-        if not (self._has_majority(at) and sure >= DECIDES and (is_likeliest or len(beside) > 1)):
+        if not (
+            self._has_majority(shift) and sure >= DECIDES and (is_likeliest or len(beside) > 1)
+        ):
             return measured.refused
         assert chosen.match is not None
         made = measured.decided(chosen.match, self._rig, self._settings)
         if made.reconstruction is not None:
-            self._before = made.reconstruction, at
+            self._before = made.reconstruction, shift
         return made
 
     def _alike(self, candidates: tuple[Candidate, ...], beside: list[Reconstruction]) -> int | None:
