@@ -58,7 +58,8 @@ class Alarms:
     """
 
     def __init__(self, limits: Limits) -> None:
-        self._limits = limits
+        self.limits = limits
+        """The limits in use."""
         self._shown: dict[str, Alarm] = {}
         self._held_s: dict[str, float] = {}
         """Last time at which the cause of each alarm was, or may have been, present."""
@@ -67,15 +68,10 @@ class Alarms:
         """Number and time of the last frame."""
         self._turn = threading.Lock()
 
-    @property
-    def limits(self) -> Limits:
-        """The limits in use."""
-        return self._limits
-
     def set_limits(self, limits: Limits) -> list[Alarm]:
         """Replace the limits from the next frame on; returns the alarms that this ends."""
         with self._turn:
-            former, self._limits = self._limits, limits
+            former, self.limits = self.limits, limits
             changed = [name for name in NAMES if former.of(name) != limits.of(name)]
             codes = [f"{name}-{end}" for name in changed for end in ("low", "high")]
             if not limits.are_set:
@@ -116,9 +112,9 @@ class Alarms:
             self._newest = (frame, time_s)
             if measures is not None and self._misses(measures):
                 measures, reason = None, "a size with limits is unknown"
-            counted = measures is None and self._limits.are_set
+            counted = measures is None and self.limits.are_set
             self._unmeasured = self._unmeasured + 1 if counted else 0
-            causes = self._causes(measures, reason) if self._limits.are_set else {}
+            causes = self._causes(measures, reason) if self.limits.are_set else {}
             causes.pop(DOUBTFUL, None)
             if setup_doubt:
                 causes[DOUBTFUL] = f"The set-up is doubtful: {setup_doubt}"
@@ -139,7 +135,7 @@ class Alarms:
     def silence(self, words: str) -> list[Alarm]:
         """Raise the alarm that no frame is measured; returns it if it is new."""
         with self._turn:
-            if not self._limits.are_set:
+            if not self.limits.are_set:
                 return []
             self._held_s[SILENT] = self._newest[1]
             return self._raise(SILENT, words, *self._newest)
@@ -155,7 +151,7 @@ class Alarms:
     def _misses(self, measures: Measures) -> bool:
         """Whether a size with limits is unknown."""
         return any(
-            standing(size, self._limits.of(size.name)) == "unknown" for size in sizes_of(measures)
+            standing(size, self.limits.of(size.name)) == "unknown" for size in sizes_of(measures)
         )
 
     def _causes(self, measures: Measures | None, reason: str) -> dict[str, str | None]:
@@ -163,7 +159,7 @@ class Alarms:
         if measures is None:
             unknown: dict[str, str | None] = dict.fromkeys(self._shown)
             unknown.pop(SILENT, None)
-            if self._unmeasured < self._limits.unmeasured:
+            if self._unmeasured < self.limits.unmeasured:
                 return unknown
             words = (
                 f"{pluralize(self._unmeasured, 'frame')} in a row could not be measured: {reason}"
@@ -171,9 +167,9 @@ class Alarms:
             return {**unknown, NOT_MEASURED: words}
         found: dict[str, str | None] = {}
         for name, size in zip(NAMES, sizes_of(measures), strict=True):
-            stands = standing(size, self._limits.of(name))
+            stands = standing(size, self.limits.of(name))
             if stands in ("low", "high"):
-                found[f"{name}-{stands}"] = in_words(size, stands, self._limits)
+                found[f"{name}-{stands}"] = in_words(size, stands, self.limits)
             elif stands == "in doubt":
                 found |= {f"{name}-low": None, f"{name}-high": None}
         return found

@@ -42,8 +42,8 @@ class FrameQueue:
     def __init__(self) -> None:
         self._turn = threading.Lock()
         self._waiting: deque[CameraFrame] = deque()
-        self._every, self._due = 1, 0
-        """Step between frames, and the smallest number of the next frame."""
+        self.every, self._due = 1, 0
+        """Step between measured frames, and the smallest number of the next frame."""
         self._last: CameraFrame | None = None
         self._interval_s = self._took_s = 0.0
         """Running means of the frame interval and of the measuring time."""
@@ -55,17 +55,8 @@ class FrameQueue:
         """Whether the queue overflowed, and whether the frame being measured is one in order."""
         self._catching_up_s = 0.0
         """Measuring time of the frames in order so far."""
-        self._skipped = 0
-
-    @property
-    def every(self) -> int:
-        """Step between measured frames."""
-        return self._every
-
-    @property
-    def skipped(self) -> int:
+        self.skipped = 0
         """Number of frames passed over for a newer one, in addition to those between steps."""
-        return self._skipped
 
     def put(self, frame: CameraFrame) -> None:
         """Queue a frame of the camera if it is due."""
@@ -75,11 +66,11 @@ class FrameQueue:
                 # By the computer's clock, as a camera's may be reset.
                 since_s = frame.arrived_s - last.arrived_s
                 self._interval_s = _mean(self._interval_s, since_s / (frame.number - last.number))
-            if self._due - self._every < frame.number < self._due:
+            if self._due - self.every < frame.number < self._due:
                 return
             if len(self._waiting) < MOST:
                 self._waiting.append(frame)
-                self._due = frame.number + self._every
+                self._due = frame.number + self.every
             else:
                 self._is_behind = True
 
@@ -98,11 +89,11 @@ class FrameQueue:
             else:
                 frame = self._last
                 self._is_behind = False
-                self._due = frame.number + self._every
+                self._due = frame.number + self.every
                 self._waiting.clear()
             given, self._given = self._given, frame
             if given is not None:
-                self._skipped += max(frame.number - given.number - self._every, 0)
+                self.skipped += max(frame.number - given.number - self.every, 0)
             return frame
 
     def done(self, tracked: bool, took_s: float) -> None:
@@ -114,7 +105,7 @@ class FrameQueue:
                 if self._was_in_order or self._is_far():
                     # The queued frames cannot be tracked from this one, or are older still.
                     self._waiting.clear()
-                    self._every, self._due, self._took_s = self._steps(SWING_S), 0, 0.0
+                    self.every, self._due, self._took_s = self._steps(SWING_S), 0, 0.0
                 self._in_order = len(self._waiting)
                 return
             if self._catching_up_s > CATCH_UP_S:
@@ -125,9 +116,9 @@ class FrameQueue:
             if self._tracked < 2 * MOST:
                 least_s = max(least_s, SWING_S)
             wanted = self._steps(least_s)
-            grown_s = EASE * self._interval_s * (self._every - 1)
-            if wanted > self._every or (wanted < self._every and least_s < grown_s):
-                self._every = wanted
+            grown_s = EASE * self._interval_s * (self.every - 1)
+            if wanted > self.every or (wanted < self.every and least_s < grown_s):
+                self.every = wanted
 
     def _is_far(self) -> bool:
         """Whether the next queued frame is too far from the one that was measured."""

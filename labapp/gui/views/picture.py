@@ -108,7 +108,8 @@ class PictureView(Drawn):
         """Points that can be dragged."""
         self.menu_actions: Sequence[QAction] = ()
         """Actions of the page for the object clicked, listed above the view's actions."""
-        self._image: GreyImage | None = None
+        self.picture: GreyImage | None = None
+        """The displayed picture."""
         self._levels = (0.0, 1.0)
         self._fits = True
         self._region: QRectF | None = None
@@ -150,7 +151,7 @@ class PictureView(Drawn):
 
         Zoom is kept if the size is the same; contrast is kept if also the brightness is similar.
         """
-        former, self._image = self._image, grey
+        former, self.picture = self.picture, grey
         self.changed.emit()
         self._empty.setText(why_not if grey is None else "")
         self._item.setVisible(grey is not None)
@@ -170,11 +171,6 @@ class PictureView(Drawn):
             u, v = columns + side, rows + side
             self.box.setLimits(xMin=-side, xMax=u, yMin=-side, yMax=v, minXRange=MOST_ZOOM_PX)
             self.fit()
-
-    @property
-    def picture(self) -> GreyImage | None:
-        """The displayed picture."""
-        return self._image
 
     def add(self, item: QGraphicsItem) -> None:
         """Add an overlay."""
@@ -257,9 +253,9 @@ class PictureView(Drawn):
         self._fits = False
 
     def _refit(self) -> None:
-        if not self._fits or self._image is None:
+        if not self._fits or self.picture is None:
             return
-        rows, columns = self._image.shape
+        rows, columns = self.picture.shape
         if self._region is None:
             self.box.setRange(QRectF(-0.5, -0.5, columns, rows), padding=0.01)
         else:
@@ -272,8 +268,8 @@ class PictureView(Drawn):
 
     def auto_contrast(self) -> None:
         """Adjust the levels of black and white to the picture."""
-        if self._image is not None:
-            self._levels = auto_levels(self._image)
+        if self.picture is not None:
+            self._levels = auto_levels(self.picture)
         self._contrast.setValue(0)
         self._item.setLevels(self._shown_levels())
 
@@ -318,7 +314,7 @@ class PictureView(Drawn):
     def _moved(self, at: QPointF) -> None:
         place = self.box.mapSceneToView(at)
         u, v = float(place.x()), float(place.y())
-        level = level_at(self._image, u, v)
+        level = level_at(self.picture, u, v)
         words = "" if level is None else f"u {u:.1f}, v {v:.1f} px, level {level:g}"
         show_words(self._place, words)
         self._place.adjustSize()

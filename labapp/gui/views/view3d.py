@@ -88,7 +88,8 @@ class View3d(Drawn):
         super().__init__(name, KEYS_TOLD)
         self.setMinimumSize(160, 120)
         self._words = ""
-        self._scene: Scene | None = None
+        self.scene: Scene | None = None
+        """The displayed scene."""
         self._drawing: Drawing | None = None
         self._wanted: Camera | Direction | None = None
         self._fits = True
@@ -114,11 +115,6 @@ class View3d(Drawn):
 
     # --- what is shown -----------------------------------------------------------------------
 
-    @property
-    def scene(self) -> Scene | None:
-        """The displayed scene."""
-        return self._scene
-
     def show_scene(self, scene: Scene | None) -> None:
         """Show a scene in the colours of the theme; None: show nothing."""
         if scene is not None:
@@ -128,7 +124,7 @@ class View3d(Drawn):
                 foreground=palette.color(QPalette.ColorRole.Text).name(),
                 background=palette.color(QPalette.ColorRole.Base).name(),
             )
-        self._scene = scene
+        self.scene = scene
         self._mark()
         self._refresh()
 
@@ -174,7 +170,7 @@ class View3d(Drawn):
 
     def picture(self) -> npt.NDArray[np.uint8] | None:
         """The visible picture, shape (height, width, 3), R, G, B; None if there is none."""
-        if self._drawing is None or self._scene is None:
+        if self._drawing is None or self.scene is None:
             return None
         self._drawing.plotter.render()
         return np.ascontiguousarray(self._drawing.plotter.screenshot(return_img=True))
@@ -200,10 +196,10 @@ class View3d(Drawn):
 
     def surface_point(self, at: QPointF) -> FloatArray | None:
         """Surface point visible at a position in the view, shape (3,), mm, or None."""
-        if self._scene is None or self._drawing is None:
+        if self.scene is None or self._drawing is None:
             return None
         across, up = 2 * at.x() / max(self.width(), 1) - 1, 1 - 2 * at.y() / max(self.height(), 1)
-        return seen_point(self._scene, view_matrix(self._drawing.plotter.renderer), across, up)
+        return seen_point(self.scene, view_matrix(self._drawing.plotter.renderer), across, up)
 
     def point_words(self, point_mm: FloatArray) -> str:
         """Text of a surface point, with the ± of its height if known."""
@@ -215,7 +211,7 @@ class View3d(Drawn):
     @property
     def read_off(self) -> str:
         """Text of the point that was read off; empty if there is none."""
-        return "" if self._scene is None else self._scene.mark_words.replace("\n", " ")
+        return "" if self.scene is None else self.scene.mark_words.replace("\n", " ")
 
     def read_point(self, at: QPointF) -> None:
         """Read off the point at a position in the view; off the surface, remove the mark."""
@@ -237,14 +233,14 @@ class View3d(Drawn):
 
     def _mark(self) -> None:
         """Mark the point that was read off, at the same X and Y on the surface of another frame."""
-        scene, words, mark = self._scene, "", np.empty((0, 3))
+        scene, words, mark = self.scene, "", np.empty((0, 3))
         if scene is None:
             return
         if self._point_mm is not None:
             hit = point_over(scene, *self._point_mm)
             if hit is not None:
                 mark, words = hit[None], self.point_words(hit).replace(", Z", ",\nZ")
-        self._scene = replace(scene, mark_mm=mark, mark_words=words)
+        self.scene = replace(scene, mark_mm=mark, mark_words=words)
         self.describe(self.read_off or self._words)
 
     def close_view(self) -> None:
@@ -266,15 +262,15 @@ class View3d(Drawn):
 
     def _draw(self) -> bool:
         """Update the drawing to the scene; return False if there is nothing to show."""
-        if self._scene is None or not can_draw():
+        if self.scene is None or not can_draw():
             return False
         if self._drawing is None:
             self.window().installEventFilter(self)
-            self._drawing = build_scene(self._new_plotter(), self._scene, steady=True)
+            self._drawing = build_scene(self._new_plotter(), self.scene, steady=True)
             if self._wanted is not None:
                 self._drawing.look(self._wanted)
         else:
-            self._drawing.update(self._scene)
+            self._drawing.update(self.scene)
         return True
 
     def _pixels(self) -> tuple[int, int]:
@@ -403,8 +399,8 @@ class View3d(Drawn):
 
     def take_colours(self) -> None:
         """Draw in the colours of the theme."""
-        if self._scene is not None:
-            self.show_scene(self._scene)
+        if self.scene is not None:
+            self.show_scene(self.scene)
 
     def _paint_words(self, painter: QPainter, words: str) -> None:
         painter.setPen(self.palette().color(QPalette.ColorRole.Text))

@@ -84,7 +84,7 @@ class OffscreenView(View3d):
 
     def paintEvent(self, event: QPaintEvent) -> None:
         """Show the scene, or say why there is none."""
-        if self._picture is None and self._scene is not None:
+        if self._picture is None and self.scene is not None:
             self._render()
         with QPainter(self) as painter:
             painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
@@ -92,7 +92,7 @@ class OffscreenView(View3d):
                 painter.drawImage(0, 0, self._picture)
                 self._paint_pointed(painter)
             else:
-                self._paint_words(painter, self._words if self._scene is None else NOTHING_HERE)
+                self._paint_words(painter, self._words if self.scene is None else NOTHING_HERE)
             if self.hasFocus():
                 self.paint_frame(painter)
 
@@ -189,7 +189,7 @@ class InteractiveView(View3d):
         """Show the scene, or say why there is none."""
         with QPainter(self) as painter:
             painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
-            if self._scene is None:
+            if self.scene is None:
                 self._paint_words(painter, self._words)
             elif not can_draw():
                 self._paint_words(painter, NOTHING_HERE)

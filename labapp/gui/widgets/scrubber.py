@@ -76,7 +76,8 @@ class Scrubber(QAbstractSlider):
     def __init__(self, ticks: Sequence[Tick]) -> None:
         super().__init__()
         self._ticks = tuple(ticks)
-        self._kinds: npt.NDArray[np.int64] = np.zeros(0, np.int64)
+        self.kinds: npt.NDArray[np.int64] = np.zeros(0, np.int64)
+        """Kinds of the frames, indices into the ticks, shape (n,)."""
         self._picture: QImage | None = None
         self.describe: Callable[[int], str] = lambda position: f"{position + 1}"
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
@@ -90,8 +91,8 @@ class Scrubber(QAbstractSlider):
 
     def set_kinds(self, kinds: npt.NDArray[np.int64]) -> None:
         """Show frames of these kinds, indices into the ticks, shape (n,)."""
-        if not np.array_equal(kinds, self._kinds):
-            self._kinds = np.asarray(kinds, np.int64)
+        if not np.array_equal(kinds, self.kinds):
+            self.kinds = np.asarray(kinds, np.int64)
             self._picture = None
             with QSignalBlocker(self):
                 self.setRange(0, max(0, len(kinds) - 1))
@@ -105,17 +106,12 @@ class Scrubber(QAbstractSlider):
         self._tell()
 
     def _tell(self) -> None:
-        seen = self.position_text(self.value()) if len(self._kinds) else "There are no frames"
+        seen = self.position_text(self.value()) if len(self.kinds) else "There are no frames"
         self.setAccessibleDescription(f"{seen}. {KEYS}")
 
     def position_text(self, position: int) -> str:
         """Text of a frame and its state."""
-        return f"{self.describe(position)}: {self._ticks[int(self._kinds[position])].words}"
-
-    @property
-    def kinds(self) -> npt.NDArray[np.int64]:
-        """Kinds of the frames, indices into the ticks, shape (n,)."""
-        return self._kinds
+        return f"{self.describe(position)}: {self._ticks[int(self.kinds[position])].words}"
 
     @property
     def position(self) -> int:
@@ -124,12 +120,12 @@ class Scrubber(QAbstractSlider):
 
     def position_at(self, x: float) -> int:
         """Position of the frame at a horizontal coordinate of the widget, px."""
-        return max(0, min(len(self._kinds) - 1, int(x * len(self._kinds) / max(1, self.width()))))
+        return max(0, min(len(self.kinds) - 1, int(x * len(self.kinds) / max(1, self.width()))))
 
     def go_to(self, position: int) -> None:
         """Go to the nearest existing position, as if the operator had."""
-        if len(self._kinds):
-            position = max(0, min(len(self._kinds) - 1, position))
+        if len(self.kinds):
+            position = max(0, min(len(self.kinds) - 1, position))
             if position != self.value():
                 self.moved.emit(position)
 
@@ -138,12 +134,12 @@ class Scrubber(QAbstractSlider):
     def paintEvent(self, _event: QPaintEvent) -> None:
         """Draw the ticks, which are cached for a width and kinds, and the marker over them."""
         with QPainter(self) as painter:
-            if not len(self._kinds):
+            if not len(self.kinds):
                 return
             if self._picture is None:
                 self._picture = self._drawn()
             painter.drawImage(QPointF(0, RAIL_PX), self._picture)
-            width = self.width() / len(self._kinds)
+            width = self.width() / len(self.kinds)
             left = self.value() * width
             middle = left + width / 2
             painter.setRenderHint(QPainter.RenderHint.Antialiasing)
@@ -172,11 +168,11 @@ class Scrubber(QAbstractSlider):
         scale = self.devicePixelRatioF()
         columns = max(1, round(self.width() * scale))
         rows = max(8, round((self.height() - RAIL_PX) * scale))
-        kinds = aggregated(self._kinds, columns)
+        kinds = aggregated(self.kinds, columns)
         colours, masks = self._looks(rows)
         pixels = np.where(masks[kinds].T, colours[kinds][None, :], np.uint32(0))
-        if columns / len(self._kinds) >= GAP_FROM_PX * scale:
-            frame = np.arange(columns) * len(self._kinds) // columns
+        if columns / len(self.kinds) >= GAP_FROM_PX * scale:
+            frame = np.arange(columns) * len(self.kinds) // columns
             pixels[:, 1:][:, frame[1:] != frame[:-1]] = 0
         pixels = np.ascontiguousarray(pixels, np.uint32)
         picture = QImage(
@@ -229,7 +225,7 @@ class Scrubber(QAbstractSlider):
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Go a tenth of all frames with Page Up and Down; the window handles the other keys."""
-        page = max(1, len(self._kinds) // 10)
+        page = max(1, len(self.kinds) // 10)
         if event.key() == Qt.Key.Key_PageUp:
             self.go_to(self.value() - page)
         elif event.key() == Qt.Key.Key_PageDown:
@@ -239,7 +235,7 @@ class Scrubber(QAbstractSlider):
 
     def event(self, event: QEvent) -> bool:
         """Show a tooltip for the frame under the pointer."""
-        if isinstance(event, QHelpEvent) and len(self._kinds):
+        if isinstance(event, QHelpEvent) and len(self.kinds):
             position = self.position_at(event.pos().x())
             QToolTip.showText(event.globalPos(), self.position_text(position), self)
             return True

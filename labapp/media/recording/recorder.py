@@ -115,7 +115,8 @@ class Recorder:
         self._queue: deque[_Item] = deque()
         self._held_byte = 0
         self._newest_s = 0.0
-        self._running: Take | None = None
+        self.running: Take | None = None
+        """The present recording."""
         self._closing = self._is_short = self._is_behind = False
         self._writing_since_s = float("inf")
         self._lost = Tally(self._emit_lost)
@@ -124,11 +125,6 @@ class Recorder:
         self._thread.start()
 
     # --- control ------------------------------------------------------------------------------
-
-    @property
-    def running(self) -> Take | None:
-        """The present recording."""
-        return self._running
 
     @property
     def waiting_mb(self) -> float:
@@ -156,7 +152,7 @@ class Recorder:
                 if self._ring[0].time_s >= frame.time_s - self.plan.before_s:
                     events += self._ring_is_short(frame)
                 self._held_byte -= _size(self._ring.popleft())
-            running = self._running
+            running = self.running
             has_room = self._held_byte + size <= self._memory_byte
             if running is None and has_room and self.plan.before_s > 0:
                 self._ring.append(frame)
@@ -178,10 +174,10 @@ class Recorder:
         with self._condition:
             if self._closing:
                 raise InputError("recording", "trigger", "closed", "one before it is closed")
-            if self._running is not None:
-                return self._running
+            if self.running is not None:
+                return self.running
             path = self._apart(self._new_path())
-            take = self._running = Take(path, triggered_s=self._newest_s)
+            take = self.running = Take(path, triggered_s=self._newest_s)
             self.takes.append(take)
             self._queue.extend((take, frame) for frame in self._ring)
             count = len(self._ring)
@@ -197,14 +193,14 @@ class Recorder:
         """End the present recording; queued frames are still written."""
         self._lost.flush(now=True)
         with self._condition:
-            if self._running is not None:
-                self._end(self._running)
+            if self.running is not None:
+                self._end(self.running)
 
     def note(self, event: Event, time_s: float | None = None) -> None:
         """Add an event to the present notes; ``time_s`` by the camera's clock, None: now."""
         with self._condition:
-            if self._running is not None:
-                self._add_note(self._running, event, time_s)
+            if self.running is not None:
+                self._add_note(self.running, event, time_s)
                 self._condition.notify()
 
     def close(self) -> None:
@@ -212,8 +208,8 @@ class Recorder:
         self.stop()
         with self._condition:
             self._closing = True
-            if self._running is not None:  # triggered after `stop`
-                self._end(self._running)
+            if self.running is not None:  # triggered after `stop`
+                self._end(self.running)
             self._held_byte -= sum(_size(frame) for frame in self._ring)
             self._ring.clear()
             self._condition.notify()
@@ -284,7 +280,7 @@ class Recorder:
 
     def _end(self, take: Take) -> None:
         self._queue.append((take, None))
-        self._running = None
+        self.running = None
         self._condition.notify()
 
     def _add_note(self, take: Take, event: Event, time_s: float | None = None) -> None:
