@@ -26,6 +26,11 @@ def as_bytes(text: str) -> bytes:
     return text.encode("utf-8", "backslashreplace")
 
 
+def as_json(value: object) -> bytes:
+    """Encode as indented JSON, for files that people read."""
+    return as_bytes(json.dumps(value, indent=2, ensure_ascii=False) + "\n")
+
+
 def beside(path: Path) -> Path:
     """Return a hidden, unpredictable path in the folder of ``path``, safe from planted links.
 

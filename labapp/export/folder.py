@@ -40,7 +40,7 @@ from labapp.export.rendering.studio import PICTURE_PX, drawing_errors, drawing_p
 from labapp.export.results import SURFACES, surface_files
 from labapp.export.summary import Summary
 from labapp.export.tables import TABLES, csv_header, csv_rows, frame_tables
-from labapp.files import as_bytes, beside, only_writer, sha256_of
+from labapp.files import as_bytes, as_json, beside, only_writer, sha256_of
 from labapp.media import GreyImage
 from labapp.system import sync_folder
 from labapp.text import SIGMA_OF, now
@@ -288,8 +288,7 @@ class _Files:
             for path in sorted(self.folder.iterdir())
         )
         manifest = {**_made(), **about, "files": [asdict(file) for file in written]}
-        text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
-        self.add(MANIFEST, as_bytes(text))
+        self.add(MANIFEST, as_json(manifest))
         _synced(self.folder / MANIFEST)
         return written
 

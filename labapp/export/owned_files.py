@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from labapp.errors import InputError, os_errors_as_input
-from labapp.files import as_bytes, read_limited, sha256_of, write_file
+from labapp.files import as_json, read_limited, sha256_of, write_file
 from labapp.version import VERSION
 
 LARGEST_RECORD = 1 << 28
@@ -111,8 +111,7 @@ def _write(
         "command": command,
         "files": {**others, **checksums},
     }
-    text = json.dumps(record, indent=2, ensure_ascii=False) + "\n"
-    write_file(folder / f"{command}.json", as_bytes(text))
+    write_file(folder / f"{command}.json", as_json(record))
 
 
 def _recorded(folder: Path, command: str) -> dict[str, str]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 import re
-from collections.abc import Collection, Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Self
@@ -21,7 +20,7 @@ from labapp.export.formats import SURFACE_FORMATS
 from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SPACING_MM, known_nodes, open_mesh, solid_mesh
 from labapp.export.tables import TABLES, csv_header, sigma_of, table_rows
-from labapp.files import as_bytes, is_of_labapp, only_writer, write_all, write_atomically
+from labapp.files import as_bytes, as_json, is_of_labapp, only_writer, write_all, write_atomically
 from labapp.text import now, unescaped_csv_text
 from labapp.version import VERSION
 
@@ -126,15 +125,14 @@ class ResultsWriter:
         }
         self._files: dict[str, io.FileIO] = {}
         self._lock = ExitStack()
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._lock.enter_context(only_writer(Path(os.path.realpath(folder))))
-            _earlier_results(folder)
-        except BaseException as error:
-            self._close_files()
-            if isinstance(error, OSError):
-                raise self._unwritable(error) from error
-            raise
+        with self._os_errors_as_input():
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                self._lock.enter_context(only_writer(Path(os.path.realpath(folder))))
+                _earlier_results(folder)
+            except BaseException:
+                self._close_files()
+                raise
 
     def write(self, result: FrameResult) -> None:
         """Write all results of one frame.
@@ -154,22 +152,21 @@ class ResultsWriter:
             ).items()
         }
         rows = result.rows or table_rows(result, self._calibration, self._sigma_parts)
-        try:
-            for path, content in surfaces.items():
-                write_atomically(path, content)
-            for name, text in rows.items():
-                write_all(self._files[name], as_bytes(text))
-            if not self._run["sigma_of"] and (covered := sigma_of(result.measurement)):
-                self._run["sigma_of"] = covered
-                self._write_run()
-        except BaseException as error:
-            for file, size in before.items():
-                file.truncate(size)
-            for path in surfaces:
-                path.unlink(missing_ok=True)
-            if isinstance(error, OSError):
-                raise self._unwritable(error) from error
-            raise
+        with self._os_errors_as_input():
+            try:
+                for path, content in surfaces.items():
+                    write_atomically(path, content)
+                for name, text in rows.items():
+                    write_all(self._files[name], as_bytes(text))
+                if not self._run["sigma_of"] and (covered := sigma_of(result.measurement)):
+                    self._run["sigma_of"] = covered
+                    self._write_run()
+            except BaseException:
+                for file, size in before.items():
+                    file.truncate(size)
+                for path in surfaces:
+                    path.unlink(missing_ok=True)
+                raise
         self.frames += 1
         self._statuses.add(result.measurement.setup_status)
 
@@ -186,7 +183,7 @@ class ResultsWriter:
         if DOUBTFUL not in (status, *self._statuses):
             return
         path = self.folder / "measures.csv"
-        try:
+        with self._os_errors_as_input():
             with path.open(encoding="utf-8", newline="") as file:
                 names, *rows = csv.reader(file)
             place = names.index("setup_status")
@@ -194,15 +191,13 @@ class ResultsWriter:
                 row[place] = row[place] and status
             self._files.pop("measures").close()
             write_atomically(path, as_bytes(unescaped_csv_text([names, *rows])))
-        except OSError as error:
-            raise self._unwritable(error) from error
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         """Write the final state of the run; without a frame, results of an earlier run are kept."""
-        try:
+        with self._os_errors_as_input() if error is None else suppress(OSError):
             try:
                 if error is None or not _earlier_results(self.folder):
                     self._begin()
@@ -210,9 +205,6 @@ class ResultsWriter:
                     self._write_state(error)
             finally:
                 self._close_files()
-        except OSError as failure:
-            if error is None:
-                raise self._unwritable(failure) from failure
 
     def _begin(self) -> None:
         """Replace the results of an earlier run by tables without frames, if not done yet.
@@ -221,19 +213,18 @@ class ResultsWriter:
         """
         if self._files:
             return
-        try:
-            for path in _earlier_results(self.folder):
-                path.unlink()
-            self._write_run()
-            for name in TABLES:
-                self._files[name] = io.FileIO(self.folder / f"{name}.csv", "a")
-                write_all(self._files[name], as_bytes(csv_header(name, self._sigma_parts)))
-        except BaseException as error:
-            with suppress(OSError):
-                self._write_state(error)
-            if isinstance(error, OSError):
-                raise self._unwritable(error) from error
-            raise
+        with self._os_errors_as_input():
+            try:
+                for path in _earlier_results(self.folder):
+                    path.unlink()
+                self._write_run()
+                for name in TABLES:
+                    self._files[name] = io.FileIO(self.folder / f"{name}.csv", "a")
+                    write_all(self._files[name], as_bytes(csv_header(name, self._sigma_parts)))
+            except BaseException as error:
+                with suppress(OSError):
+                    self._write_state(error)
+                raise
 
     def _write_state(self, error: BaseException | None) -> None:
         """Write the final state of the run, which an error may have ended, to `run.json`."""
@@ -243,23 +234,27 @@ class ResultsWriter:
         self._write_run()
 
     def _write_run(self) -> None:
-        text = json.dumps(self._run, indent=2, ensure_ascii=False) + "\n"
-        write_atomically(self.folder / RUN_FILE, as_bytes(text))
+        write_atomically(self.folder / RUN_FILE, as_json(self._run))
 
     def _close_files(self) -> None:
         for file in self._files.values():
             file.close()
         self._lock.close()
 
-    def _unwritable(self, error: OSError) -> InputError:
-        plural = "previous frame is" if self.frames == 1 else f"{self.frames} previous frames are"
-        finished = f"; the {plural} complete" if self.frames else ""
-        return InputError(
-            self.folder,
-            "results",
-            f"{error.strerror} ({Path(error.filename or self.folder).name})",
-            f"a writable folder with enough disk space{finished}",
-        )
+    @contextmanager
+    def _os_errors_as_input(self) -> Iterator[None]:
+        """Convert an `OSError`, and say which frames are complete."""
+        try:
+            yield
+        except OSError as error:
+            are = "previous frame is" if self.frames == 1 else f"{self.frames} previous frames are"
+            finished = f"; the {are} complete" if self.frames else ""
+            raise InputError(
+                self.folder,
+                "results",
+                f"{error.strerror} ({Path(error.filename or self.folder).name})",
+                f"a writable folder with enough disk space{finished}",
+            ) from error
 
 
 def _earlier_results(folder: Path) -> list[Path]:

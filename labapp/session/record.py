@@ -47,6 +47,17 @@ class Record:
     notes: str = ""
     safety: tuple[tuple[str, str], ...] = ()
 
+    @property
+    def expected_size_mm(self) -> tuple[float, float, float]:
+        """Width, length and height of the expected pool, mm; unknown ones of a usual, flat pool."""
+        from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM
+
+        return (
+            self.expected_width_mm or USUAL_WIDTH_MM,
+            self.expected_length_mm or USUAL_LENGTH_MM,
+            self.expected_height_mm or 0.0,
+        )
+
 
 @dataclass(frozen=True)
 class LaserReadings:

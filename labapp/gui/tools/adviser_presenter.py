@@ -9,8 +9,8 @@ from labapp.config.setup import pattern_values
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.setup.presenter import rig
 from labapp.gui.shell.steps import read_only
+from labapp.session.record import Record
 from labapp.session.session import Session
-from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM
 from labapp.studies.adviser.bench_limits import CONSTRAINTS, BenchLimits
 from labapp.studies.adviser.files import advised_setup
 from labapp.studies.adviser.keys import calibration_values
@@ -34,10 +34,9 @@ Values = dict[str, dict[str, Any]]
 
 def question(session: Session | None) -> Values:
     """Default request: the session's expected pool and rig, within the limits of a usual bench."""
-    record = None if session is None else session.record
-    width = (record and record.expected_width_mm) or USUAL_WIDTH_MM
-    length = (record and record.expected_length_mm) or USUAL_LENGTH_MM
-    height = (record and record.expected_height_mm) or USUAL_HEIGHT_MM
+    record = Record() if session is None else session.record
+    width, length, height = record.expected_size_mm
+    height = height or USUAL_HEIGHT_MM
     usual = BenchLimits()
     values: Values = {
         "pools": {

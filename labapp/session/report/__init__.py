@@ -28,7 +28,6 @@ from labapp.session.report.results import (
     add_example,
     add_results,
 )
-from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM
 from labapp.version import VERSION
 
 
@@ -195,16 +194,12 @@ def _set_up(story: Story, report: ReportData) -> None:
 
 def _pool_size(report: ReportData) -> tuple[float, float, float]:
     """Return width, length, height of the pool for the side view, mm: measured, else expected."""
-    record, values = report.session.record, partial(data.values, report.lines)
+    values = partial(data.values, report.lines)
     width, length = values("width_mm"), values("length_mm")
     if len(length):
         height, depth = values("height_mm").mean(), values("depth_mm").mean()
         return float(width.mean()), float(length.mean()), float(max(height, depth, key=abs))
-    return (
-        record.expected_width_mm or USUAL_WIDTH_MM,
-        record.expected_length_mm or USUAL_LENGTH_MM,
-        record.expected_height_mm or 0.0,
-    )
+    return report.session.record.expected_size_mm
 
 
 def _laser(story: Story, report: ReportData) -> None:

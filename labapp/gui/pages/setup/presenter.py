@@ -18,7 +18,7 @@ from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
 from labapp.session.record import Record
 from labapp.session.session import Session
-from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM, Fate, SideView, side_view
+from labapp.simulation.positioning import Fate, SideView, side_view
 from labapp.text import marked_setup_words, pluralize, setup_words
 
 
@@ -336,11 +336,7 @@ def bench(session: Session) -> BenchState:
     found, record, entered = default_rig(session), session.record, rig(session) is not None
     if found is None:
         return BenchState(None, None, "The drawing appears when every number is possible.")
-    size = (
-        record.expected_width_mm or USUAL_WIDTH_MM,
-        record.expected_length_mm or USUAL_LENGTH_MM,
-        record.expected_height_mm or 0.0,
-    )
+    size = record.expected_size_mm
     try:
         view = side_view(found, *size)
     except ValueError as error:
