@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import io
 import json
 import os
 import secrets
@@ -13,7 +12,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from labapp.errors import InputError, os_errors_as_input
 
@@ -82,10 +81,23 @@ def write_atomically(path: Path, content: bytes) -> None:
             shutil.copymode(path, part)
 
 
-def write_all(file: io.FileIO, content: bytes) -> None:
+class ByteFile(Protocol):
+    """An unbuffered binary file."""
+
+    def write(self, content: memoryview, /) -> int:
+        """Write all or a part, and return the number of bytes; or raise OSError."""
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
+
+
+def write_all(file: ByteFile, content: bytes | memoryview) -> None:
     """Write all of ``content``; partial writes are continued, so that a full disk raises."""
-    while content:
-        content = content[file.write(content) :]
+    rest = memoryview(content)
+    while rest:
+        rest = rest[file.write(rest) :]
 
 
 def regular_size(path: Path) -> int:

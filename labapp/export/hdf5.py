@@ -32,7 +32,7 @@ import numpy.typing as npt
 from labapp.core.surface.mesh import grid_nodes
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.export.tables import TABLES, Column, Columns
-from labapp.files import as_bytes
+from labapp.files import as_bytes, write_all
 
 TEXT_BYTES = 8
 """Length of text in a table, bytes."""
@@ -208,9 +208,7 @@ class _Disk(io.RawIOBase):
         if self._failure is None:
             try:
                 self._file.seek(self._at)
-                rest = whole
-                while rest:
-                    rest = rest[self._file.write(rest) :]
+                write_all(self._file, whole)
             except BaseException as error:  # also Ctrl-C: HDF5 must not be interrupted
                 self._failure = error
         if self._failure is not None:

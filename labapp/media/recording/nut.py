@@ -8,7 +8,7 @@ from __future__ import annotations
 import errno
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal, Protocol, cast
+from typing import Literal, cast
 
 import av
 import numpy as np
@@ -16,6 +16,7 @@ from av.error import FFmpegError
 from av.video.stream import VideoStream
 
 from labapp.errors import os_errors_as_input
+from labapp.files import ByteFile, write_all
 from labapp.media.base import GreyImage
 
 Codec = Literal["ffv1", "raw"]
@@ -27,18 +28,6 @@ BUFFER_BYTE = 1 << 22
 
 FFV1 = {"level": "3", "slices": "4", "slicecrc": "1", "g": "1", "context": "0"}
 """Intra frames only, four slices for four threads, each with a checksum."""
-
-
-class ByteFile(Protocol):
-    """Unbuffered binary file."""
-
-    def write(self, content: memoryview) -> int:
-        """Write all or a part, and return the number of bytes; or raise OSError."""
-        ...
-
-    def close(self) -> None:
-        """Close the file."""
-        ...
 
 
 class WrongFrame(ValueError):
@@ -54,9 +43,7 @@ class _CompleteWriter:
 
     def write(self, content: bytes) -> int:
         """Write all of it, or raise OSError."""
-        left = memoryview(content)
-        while left:
-            left = left[self._file.write(left) :]
+        write_all(self._file, content)
         return len(content)
 
 

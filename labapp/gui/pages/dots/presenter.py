@@ -294,17 +294,13 @@ def compared(before: Figures | None, after: Figures | None, pending: str = "") -
     texts = [("–", "–") if f is None else (f.status, str(f.matched)) for f in (before, after)]
     sigma = math.nan if after is None or pending else after.height_sigma_mm
     height = length("height_mm") + (f" ± {plain(sigma, 3)}" if math.isfinite(sigma) else "")
+    note = f"Largest height, or depth (below 0), with ± ({SIGMA_OF})"
     return [
         ResultRow("Fit", pair([t[0] for t in texts]), note="Status before the edit, and now"),
         ResultRow("Dots matched", pair([t[1] for t in texts])),
         ResultRow("ARE", length("are_mm"), unit="mm", note="Average reflection error (Eq. 6-3)"),
         ResultRow("MRE", length("mre_mm"), unit="mm", note="Largest reflection error (Eq. 6-4)"),
-        ResultRow(
-            "Height",
-            height,
-            unit="mm",
-            note=f"Largest height, or depth (below 0), with ± ({SIGMA_OF})",
-        ),
+        ResultRow("Height", height, unit="mm", note=note),
     ]
 
 

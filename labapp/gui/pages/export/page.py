@@ -285,14 +285,9 @@ class ExportPage(Page):
         self.scheme = ChoiceField(
             "Results of", tooltip="The scheme whose results are written; others must be measured"
         )
+        tip = "Distance of the surfaces' points: finer makes larger files"
         self.spacing = NumberField(
-            "Grid of surfaces",
-            "mm",
-            lowest=SMALLEST_SPACING_MM,
-            highest=1.0,
-            step=0.01,
-            decimals=2,
-            tooltip="Distance of the surfaces' points: finer makes larger files",
+            "Grid of surfaces", "mm", lowest=SMALLEST_SPACING_MM, highest=1, step=0.01, tooltip=tip
         )
         self.spacing.set_value(self.request.spacing_mm)
         self._make_view_fields()
@@ -344,13 +339,7 @@ class ExportPage(Page):
         self.picture_format = ChoiceField(
             "Frames as", FORMATS, tooltip="Format of the pictures of frames"
         )
+        tip = "How fast the film runs; empty: as fast as the frames were recorded"
         self.rate = NumberField(
-            "Film",
-            "frames/s",
-            lowest=0.1,
-            highest=1000,
-            step=1,
-            decimals=1,
-            tooltip="How fast the film runs; empty: as fast as the frames were recorded",
-            optional=True,
+            "Film", "frames/s", lowest=0.1, highest=1000, decimals=1, tooltip=tip, optional=True
         )

@@ -363,14 +363,8 @@ class LaserPage(Page):
 
 
 def _length_field(column: int) -> NumberField:
-    field = NumberField(
-        *(NAMES[column], "mm"),
-        lowest=0.01,
-        highest=1000,
-        step=0.1,
-        tooltip=MEANINGS[column],
-        optional=True,
-    )
+    name, tip = NAMES[column], MEANINGS[column]
+    field = NumberField(name, "mm", lowest=0.01, highest=1000, step=0.1, tooltip=tip, optional=True)
     field.set_placeholder(f"{presenter.EXAMPLE_MM[column]:g}")
     return field
 

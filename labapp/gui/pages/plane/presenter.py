@@ -179,26 +179,15 @@ def _board_rows(found: BoardCalibration) -> list[ResultRow]:
     seen = f"{len(found.seen[0].index)} of {len(found.board.corners_mm)}"
     worst = float(np.hypot(*found.fit.residuals_px.T).max())
     pictures = f"Over the corners of {len(found.seen)} pictures; worst {worst:.2f} px"
+    of_way = "In the picture's corner, of the way from its middle"
+    of_way += "" if found.fit.lens else ": none is seen, and none is used"
+    in_corners = "Standard uncertainty of a place on the plane in the picture's corners"
     return [
         ResultRow("Board", found.board.name, note=str(found.board)),
         ResultRow("Corners found", seen, note=f"{found.left_out} left out"),
-        ResultRow(
-            "Distortion",
-            value,
-            sigma,
-            "%",
-            note="In the picture's corner, of the way from its middle"
-            + ("" if found.fit.lens else ": none is seen, and none is used"),
-        ),
+        ResultRow("Distortion", value, sigma, "%", note=of_way),
         ResultRow("Residual", found.fit.rms_px, None, "px", 3, pictures),
-        ResultRow(
-            "± in the corners",
-            found.corner_sigma_mm,
-            None,
-            "mm",
-            3,
-            "Standard uncertainty of a place on the plane in the picture's corners",
-        ),
+        ResultRow("± in the corners", found.corner_sigma_mm, None, "mm", 3, in_corners),
     ]
 
 
