@@ -197,14 +197,13 @@ def check_values(
     made: dict[str, dict[str, object]] = {}
     quantities, homography = [], "homography" in text_values["image_calibration"]
     for one in check.changes:
-        section, _, key = one.key.partition(".")
-        name, _, axis = key.partition("[")
+        section, name, axis = _parts(one.key)
         if section == "image_calibration" and homography:
             made.setdefault(section, {})["homography"] = check.calibration.matrix.tolist()
-        elif axis:
+        elif axis is not None:
             point = made.setdefault(section, {}).setdefault(name, [0.0, 0.0])
             assert isinstance(point, list)
-            point["uv".index(axis[0])] = one.after
+            point[axis] = one.after
         else:
             made.setdefault(section, {})[name] = one.after
         quantities.append(
@@ -244,24 +243,29 @@ def unchecked_values(values: Mapping[str, Any]) -> dict[str, dict[str, object]]:
     for one in section["quantities"]:
         if not _near(_value(values, one["key"]), one["after"]):
             continue
-        part, _, key = one["key"].partition(".")
-        name, _, axis = key.partition("[")
-        if axis:
+        part, name, axis = _parts(one["key"])
+        if axis is not None:
             point = made.setdefault(part, {}).setdefault(name, list(values[part][name]))
             assert isinstance(point, list)
-            point["uv".index(axis[0])] = one["before"]
+            point[axis] = one["before"]
         else:
             made.setdefault(part, {})[name] = one["before"]
     return made
 
 
-def _value(values: Mapping[str, Any], key: str) -> float:
-    """A quantity's value in a file; the default value for a missing key, NaN without one."""
+def _parts(key: str) -> tuple[str, str, int | None]:
+    """Section, name, and the axis of a point (0 of u, 1 of v) in ``section.name[u]``."""
     section, _, name = key.partition(".")
     name, _, axis = name.partition("[")
-    lacking = [np.nan, np.nan] if axis else _DEFAULTS.get(key, np.nan)
+    return section, name, "uv".index(axis[0]) if axis else None
+
+
+def _value(values: Mapping[str, Any], key: str) -> float:
+    """A quantity's value in a file; the default value for a missing key, NaN without one."""
+    section, name, axis = _parts(key)
+    lacking = _DEFAULTS.get(key, np.nan) if axis is None else [np.nan, np.nan]
     found = values.get(section, {}).get(name, lacking)
-    return float(found["uv".index(axis[0])] if axis else found)
+    return float(found if axis is None else found[axis])
 
 
 def _given(values: Mapping[str, Any], adjusted: Iterable[str]) -> dict[str, object]:

@@ -68,6 +68,13 @@ def bounded_lines(path: Path, file: TextIO, wanted: str) -> Iterator[str]:
         yield text
 
 
+def split_header(line: str) -> tuple[str, list[str]]:
+    """Separator of a table (a comma, a semicolon or a tab) and the names of its columns."""
+    separator = max(",;\t", key=line.count)
+    cells = next(csv.reader([line], delimiter=separator), [])
+    return separator, [cell.strip() for cell in cells]
+
+
 def parse_number(cell: str, separator: str) -> float | None:
     """Parse a finite number, or return None; a decimal comma is allowed if not the separator."""
     if separator != ",":
@@ -124,8 +131,7 @@ def read_columns(
     with open_table(path, wanted, largest) as file:
         lines = bounded_lines(path, file, wanted)
         head = next(lines, "")
-        separator = max(",;\t", key=head.count)
-        names = [cell.strip() for cell in next(csv.reader([head], delimiter=separator), [])]
+        separator, names = split_header(head)
         if not all(names) or len(set(names)) < len(names) or not names:
             raise InputError(
                 path, "line 1", head.strip() or "empty", f"a name per column: {wanted}"

@@ -23,6 +23,7 @@ from labapp.config.csv_tables import (
     NumberCells,
     bounded_lines,
     open_table,
+    split_header,
 )
 from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.errors import InputError
@@ -319,8 +320,7 @@ def _find_names(path: Path, lines: Iterator[str]) -> tuple[int, str, list[_Colum
     """Return the number of the header line, the separator, the columns, and the cells per line."""
     found = ""
     for above, text in enumerate(itertools.islice(lines, LINES_ABOVE), 1):
-        separator = max(",;\t", key=text.count)
-        cells = next(csv.reader([text], delimiter=separator), [])
+        separator, cells = split_header(text)
         columns = [column for place, cell in enumerate(cells) for column in _named(cell, place)]
         quantities = [column.quantity for column in columns]
         if "time" in quantities and len(set(quantities)) > 1:

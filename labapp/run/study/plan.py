@@ -30,7 +30,7 @@ from typing import Any
 
 import tomlkit
 
-from labapp.config.csv_tables import bounded_lines, open_table, parse_number
+from labapp.config.csv_tables import bounded_lines, open_table, parse_number, split_header
 from labapp.config.settings import check_algorithm
 from labapp.config.setup import read_setup
 from labapp.config.toml_keys import Rule, check_keys, is_number, parse_toml, shown, unknown_key
@@ -345,8 +345,7 @@ def _read_csv(path: Path) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
     with open_table(path, A_STUDY, LARGEST_FILE) as file:
         lines = bounded_lines(path, file, A_STUDY)
         head = next(lines, "")
-        separator = max(",;\t", key=head.count)
-        header = [cell.strip() for cell in next(csv.reader([head], delimiter=separator), [])]
+        separator, header = split_header(head)
         twice = [name for name, count in Counter(header).items() if count > 1]
         if "file" not in header or twice:
             named = f"{shown(twice[0])} twice" if twice else head.strip() or "empty"
