@@ -14,12 +14,7 @@ import numpy.typing as npt
 from labapp.errors import InputError, os_errors_as_input
 from labapp.files import regular_size
 from labapp.media.base import GreyImage, to_grey
-from labapp.media.formats.stored import (
-    StoredFrames,
-    check_shape,
-    finite,
-    first_readable,
-)
+from labapp.media.formats.stored import READABLE, StoredFrames, check_shape, finite, first_readable
 from labapp.media.formats.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 from labapp.pixels import MOST_PIXELS
 
@@ -81,7 +76,7 @@ def read_image(path: Path) -> GreyImage:
         If it cannot be opened, is not a complete image, or contains several, NaN or infinity.
     """
     # Not read by OpenCV, for specific errors.
-    with os_errors_as_input(path, "file", "a file that may be read"):
+    with os_errors_as_input(path, "file", READABLE):
         size = regular_size(path)
         content = path.read_bytes() if size <= LARGEST_FILE else b""
     if size > LARGEST_FILE:

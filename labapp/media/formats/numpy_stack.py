@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.media.base import GreyImage, to_grey
 from labapp.media.formats.stored import (
+    READABLE,
     StoredFrames,
     ends_early,
     file_size,
@@ -66,15 +67,12 @@ class NumpyStack(StoredFrames):
 
     def __init__(self, path: Path, *, archive: bool) -> None:
         time_s, rate, claimed = None, None, 0
-        try:
+        with os_errors_as_input(path, "file", READABLE):
             if archive:
                 self._frames, time_s, rate = _from_archive(path)
             else:
                 with path.open("rb") as file:
                     self._frames, claimed = _map_array(path, file, 0, file_size(path))
-        except OSError as error:
-            why = error.strerror or error
-            raise InputError(path, "file", why, "a file that may be read") from error
         count, rows, columns = self._frames.shape[:3]
         self.warnings = ends_early(path.name, claimed, count)
         kind = self._frames.dtype

@@ -18,6 +18,7 @@ from av.index import IndexEntry
 from av.packet import Packet
 
 from labapp.core.values import FloatArray, ReadOnlyArrays
+from labapp.media.formats.stored import ends_early
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -247,11 +248,7 @@ class PacketTable(ReadOnlyArrays):
             number,
             time_s,
             timing.rate_hz,
-            warnings=(
-                f"{name} ends early: its header says {timing.claimed} frames, "
-                f"{len(elapsed_s)} of them complete",
-            )
-            * early,
+            warnings=ends_early(name, timing.claimed, len(elapsed_s)) if early else (),
         )
 
     def seek_stamps(self, packet: int) -> list[int]:

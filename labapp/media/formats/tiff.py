@@ -17,9 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.media.base import GreyImage, to_grey
 from labapp.media.formats.stored import (
+    READABLE,
     StoredFrames,
     check_shape,
     ends_early,
@@ -189,12 +190,10 @@ class TiffStack(StoredFrames):
 def _guarded(path: Path, read: Callable[[], Result]) -> Result:
     """Call ``read``, and convert any error of tifffile to an `InputError`."""
     try:
-        return read()
+        with os_errors_as_input(path, "file", READABLE):
+            return read()
     except InputError:
         raise
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(path, "file", reason, "a file that may be read") from error
     except Exception as error:
         # tifffile raises nearly every kind of error for damaged tags.
         raise InputError(path, "content", "cannot be decoded", A_TIFF) from error

@@ -34,7 +34,7 @@ from labapp.media.formats.packets import (
     number_by_order,
     number_by_stamp,
 )
-from labapp.media.formats.stored import check_shape
+from labapp.media.formats.stored import READABLE, check_shape
 from labapp.pixels import most_decoded
 
 NEAR_PACKETS = 8
@@ -415,7 +415,7 @@ class VideoSource(FrameSource):
 def _fingerprint(path: Path) -> tuple[int, int]:
     """Return the size, bytes, and a checksum of both ends of a file, which identify it."""
     part = 1 << 16
-    with os_errors_as_input(path, "file", "a file that may be read"), path.open("rb") as file:
+    with os_errors_as_input(path, "file", READABLE), path.open("rb") as file:
         ends = file.read(part)
         size = file.seek(0, 2)
         file.seek(max(0, size - part))
