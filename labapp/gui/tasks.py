@@ -84,7 +84,7 @@ class Task:
     thread: threading.Thread
     on_part: Callable[[Any], None] | None
     on_done: Callable[[Any], None] | None
-    beside: Callable[[str], object] | None
+    show_answer: Callable[[str], object] | None
     """These are called on the GUI thread with parts, the result, and the reason of a failure."""
     kind: str
     """Tasks of the same kind share a failure: "Exporting" for any folder."""
@@ -140,7 +140,7 @@ class Tasks(QObject):
         work: Work,
         on_done: Callable[[Any], None] | None = None,
         on_part: Callable[[Any], None] | None = None,
-        beside: Callable[[str], object] | None = None,
+        show_answer: Callable[[str], object] | None = None,
         kind: str = "",
         is_lasting: bool = False,
     ) -> Task:
@@ -154,18 +154,20 @@ class Tasks(QObject):
             Called on the GUI thread with what ``work`` returns, and with each `Control.part`.
             Not called after a failure, nor once the work has noticed a cancel. Work that completes
             before it notices one has changed its session or files, and ``on_done`` says so.
-        beside
+        show_answer
             Also shows the reason of a failure at the pressed button; called with "" at the start.
         kind
             A failure is cleared when work of its kind starts again; empty: its title.
         is_lasting
             Whether it continues when another session is opened.
         """
-        if beside is not None:
-            beside("")
+        if show_answer is not None:
+            show_answer("")
         control = Control()
         thread = threading.Thread(target=_run, args=(work, control), name=title, daemon=True)
-        task = Task(title, control, thread, on_part, on_done, beside, kind or title, is_lasting)
+        task = Task(
+            title, control, thread, on_part, on_done, show_answer, kind or title, is_lasting
+        )
         self.active.append(task)
         self.settled.emit(task.kind)
         thread.start()
@@ -212,8 +214,8 @@ class Tasks(QObject):
         self.active.remove(task)
         if kind == "failed":
             self.failed.emit(task.title, value, task.kind)
-            if task.beside is not None:
-                task.beside(f"{PROBLEM} {capitalized(value)}")
+            if task.show_answer is not None:
+                task.show_answer(f"{PROBLEM} {capitalized(value)}")
         elif kind == "done" and task.on_done is not None:
             task.on_done(value)
         elif kind == "cancelled" and task.asked_to_stop:

@@ -168,7 +168,10 @@ class Workspace(QObject):
             self.settle(SIZE)
 
     def run_or_report(
-        self, work: Callable[[], T], cause: str = "", beside: Callable[[str], object] | None = None
+        self,
+        work: Callable[[], T],
+        cause: str = "",
+        show_answer: Callable[[str], object] | None = None,
     ) -> T | None:
         """Run a short operation; report an error as a message, and return None.
 
@@ -176,7 +179,7 @@ class Workspace(QObject):
         ----------
         cause
             Error shown until this cause is settled, see `say_wrong`; empty: until it is read.
-        beside
+        show_answer
             Also shows the error at the pressed button; called with an empty text on success.
         """
         try:
@@ -187,19 +190,19 @@ class Workspace(QObject):
                 self.say_wrong(cause, words)
             else:
                 self.notified.emit(words, True)
-            if beside is not None:
-                beside(f"{PROBLEM} {words}")
+            if show_answer is not None:
+                show_answer(f"{PROBLEM} {words}")
             return None
         self.settle(cause)
-        if beside is not None:
-            beside("")
+        if show_answer is not None:
+            show_answer("")
         return done
 
     def attempt(
         self,
         change: Callable[[Session], object],
         cause: str = EDITING,
-        beside: Callable[[str], object] | None = None,
+        show_answer: Callable[[str], object] | None = None,
     ) -> bool:
         """Change the session; report an error and return False if it fails.
 
@@ -209,7 +212,7 @@ class Workspace(QObject):
         session = self.session
         if session is None:
             return False
-        done = self.run_or_report(lambda: (change(session),), cause, beside) is not None
+        done = self.run_or_report(lambda: (change(session),), cause, show_answer) is not None
         if done:
             self.settle(EDITING)
         self.changed.emit()
@@ -269,7 +272,7 @@ class Workspace(QObject):
         frames: Sequence[int] | None = None,
         *,
         warm: bool = False,
-        beside: Callable[[str], object] | None = None,
+        show_answer: Callable[[str], object] | None = None,
     ) -> None:
         """Measure frames in the background; None: those that are not measured, or stale.
 
@@ -279,7 +282,7 @@ class Workspace(QObject):
         ----------
         warm
             Whether each frame starts from the previous one, as suits a fast recording.
-        beside
+        show_answer
             Also shows the outcome at the pressed button.
         """
         session = self.session
@@ -313,8 +316,8 @@ class Workspace(QObject):
         def finished(counts: tuple[int, int, int]) -> None:
             words = measured_text(*counts)
             self.notified.emit(words, False)
-            if beside is not None:
-                beside(f"{PROBLEM if any(counts[1:]) else DONE} {words}")
+            if show_answer is not None:
+                show_answer(f"{PROBLEM if any(counts[1:]) else DONE} {words}")
 
         def kept(seen: Overview | None) -> None:
             if seen is None:
@@ -323,7 +326,7 @@ class Workspace(QObject):
                 self._overview = seen
                 self.measured.emit()
 
-        self._measuring.append(self.tasks.start(MEASURING, work, finished, kept, beside))
+        self._measuring.append(self.tasks.start(MEASURING, work, finished, kept, show_answer))
 
     def _measuring_pool(self, warm: bool) -> ProcessPoolExecutor:
         from labapp.run.measurers import measuring_pool

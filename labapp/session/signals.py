@@ -333,10 +333,10 @@ def _find_names(path: Path, lines: Iterator[str]) -> tuple[int, str, list[_Colum
     raise InputError(path, "columns", found or "nothing", A_TABLE)
 
 
-def _named(cell: str, place: int, beside: str | None = None) -> list[_Column]:
+def _named(cell: str, place: int, channel_unit: str | None = None) -> list[_Column]:
     """Return the column with that header; empty if it is not one of a known quantity and unit.
 
-    ``beside`` is its unit if the header has none.
+    ``channel_unit`` is its unit if the header has none.
     """
     name = cell.strip()
     parts = re.fullmatch(r"(.*?)[\s_]*(?:[\[(]\s*(\S+?)\s*[\])])?", name)
@@ -346,8 +346,8 @@ def _named(cell: str, place: int, beside: str | None = None) -> list[_Column]:
         own = unit.lower() if unit is not None else None
         if own is None and (behind := end.rpartition("_"))[0] and behind[2] in units:
             end, own = behind[0], behind[2]
-        if own is None and beside is not None:
-            own = beside.strip().lower()
+        if own is None and channel_unit is not None:
+            own = channel_unit.strip().lower()
         if re.fullmatch(NAMES[quantity], end) and (own is None or own in units):
             return [_Column(quantity, name, place, units[own] if own is not None else 1.0)]
     return []

@@ -46,11 +46,11 @@ def test_followed_frames_and_pulses_are_no_failures(
     messages: list[str] = []
     workspace.notified.connect(lambda words, _: messages.append(words))
     workspace.show(Session.open(copy_sample("gmaw")))
-    beside: list[str] = []
+    answers: list[str] = []
     with qtbot.waitSignal(workspace.notified):
-        workspace.measure(range(12), beside=beside.append)
+        workspace.measure(range(12), show_answer=answers.append)
     assert messages == ["12 frames measured"]
-    assert beside[-1] == f"{DONE} 12 frames measured"
+    assert answers[-1] == f"{DONE} 12 frames measured"
     workspace.close()
 
 
@@ -70,8 +70,8 @@ def test_frames_out_of_date_by_a_change_while_measuring_are_reported(
             yield each
 
     monkeypatch.setattr(session, "measure_each", held)
-    beside: list[str] = []
-    workspace.measure([0], beside=beside.append)
+    answers: list[str] = []
+    workspace.measure([0], show_answer=answers.append)
     qtbot.waitUntil(begun.is_set)
     assert workspace.attempt(
         lambda own: own.set_settings(replace(own.settings, correspondence="S/S"))
@@ -79,7 +79,7 @@ def test_frames_out_of_date_by_a_change_while_measuring_are_reported(
     with qtbot.waitSignal(workspace.notified) as told:
         changed.set()
     assert told.args[0] == measured_text(1, 0, 1) != measured_text(1, 0, 0)
-    assert beside[-1].startswith(PROBLEM)
+    assert answers[-1].startswith(PROBLEM)
     workspace.close()
 
 

@@ -52,7 +52,7 @@ class LivePenetration(QWidget):
         def done(model: PenetrationModel) -> None:
             self.set_model((path.stem, model))
 
-        self._workspace.tasks.start("Reading the model", work, done, beside=self.words.setText)
+        self._workspace.tasks.start("Reading the model", work, done, show_answer=self.words.setText)
 
     def set_model(self, named: tuple[str, PenetrationModel] | None) -> None:
         """Use another model; None: no model."""

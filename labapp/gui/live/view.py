@@ -136,7 +136,7 @@ class LiveView(QObject):
                 "Looking for cameras",
                 lambda _: find_cameras(),
                 done,
-                beside=self.answer.setText,
+                show_answer=self.answer.setText,
             )
 
     def start(self) -> None:
@@ -174,7 +174,7 @@ class LiveView(QObject):
             f"Opening {name}",
             work,
             lambda _: self._opened(live),
-            beside=self.answer.setText,
+            show_answer=self.answer.setText,
             kind="Opening the camera",
         )
         self.live = live

@@ -65,9 +65,9 @@ class Page(QWidget):
         """Reason why the session cannot be changed; empty if it can."""
         return read_only(self.workspace.session)
 
-    def confirm(self, words: str, beside: Message | None = None) -> None:
+    def confirm(self, words: str, answer: Message | None = None) -> None:
         """Report the success of an action in `answer` or in another message at the button."""
-        self._answer_in(beside).setText(f"{DONE} {words}")
+        self._answer_in(answer).setText(f"{DONE} {words}")
         self.workspace.notified.emit(words, False)
 
     def start_task(
@@ -76,7 +76,7 @@ class Page(QWidget):
         work: Work,
         on_done: Callable[[Any], None],
         kind: str = "",
-        beside: Message | None = None,
+        answer: Message | None = None,
         once: bool = False,
     ) -> Task:
         """Start work in the background, see `Tasks.start`; a failure is shown in `answer`.
@@ -86,8 +86,8 @@ class Page(QWidget):
         running = (task for task in self.workspace.tasks.active if task.title == title)
         if once and (task := next(running, None)) is not None:
             return task
-        say = self._answer_in(beside).setText
-        return self.workspace.tasks.start(title, work, on_done, beside=say, kind=kind)
+        say = self._answer_in(answer).setText
+        return self.workspace.tasks.start(title, work, on_done, show_answer=say, kind=kind)
 
     def start_latest(
         self,
@@ -117,9 +117,9 @@ class Page(QWidget):
         self._latest[name] = begun, given
         return begun
 
-    def _answer_in(self, beside: Message | None) -> Message:
+    def _answer_in(self, answer: Message | None) -> Message:
         """The message for an outcome; it is cleared when another session is opened."""
-        message = beside or self.answer
+        message = answer or self.answer
         self._answers.add(message)
         return message
 
@@ -127,7 +127,7 @@ class Page(QWidget):
         """Change the session by a function of it and the new value when a field is edited."""
         field.edited.connect(
             lambda value: self.workspace.attempt(
-                lambda session: change(session, value), beside=self.answer.setText
+                lambda session: change(session, value), show_answer=self.answer.setText
             )
         )
 

@@ -120,7 +120,7 @@ def measure(window: MainWindow, frames: list[int] | None) -> None:
         workspace.say_wrong(MEASURING, why)
         window.show_answer(f"{PROBLEM} {why}")
     else:
-        workspace.measure(frames, beside=window.show_answer)
+        workspace.measure(frames, show_answer=window.show_answer)
 
 
 def enter_setup(window: MainWindow) -> None:

@@ -91,7 +91,7 @@ class Files(QObject):
 
         def opened(_: None) -> None:
             session = self.workspace.run_or_report(
-                lambda: new_draft(recording), beside=self.refused.emit
+                lambda: new_draft(recording), show_answer=self.refused.emit
             )
             if session is not None:
                 self._show(session, recording.parent)
@@ -99,7 +99,7 @@ class Files(QObject):
 
         title = f"Opening {recording.name}"
         self.workspace.tasks.start(
-            title, check, opened, beside=self.refused.emit, kind="Opening a recording"
+            title, check, opened, show_answer=self.refused.emit, kind="Opening a recording"
         )
 
     def name_draft(self) -> bool:
@@ -134,7 +134,7 @@ class Files(QObject):
                 path.unlink()
                 return True
 
-            if self.workspace.run_or_report(delete, beside=self.refused.emit) is None:
+            if self.workspace.run_or_report(delete, show_answer=self.refused.emit) is None:
                 return
         self.preferences.remember(lambda before: before.without_recent(path))
 
@@ -172,7 +172,9 @@ class Files(QObject):
             return True
         if not self.may_close():
             return False
-        session = self.workspace.run_or_report(lambda: self._opened(path), beside=self.refused.emit)
+        session = self.workspace.run_or_report(
+            lambda: self._opened(path), show_answer=self.refused.emit
+        )
         if session is None:
             return False
         self._show(session)

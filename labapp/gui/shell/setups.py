@@ -69,7 +69,7 @@ class Setups(QObject):
             "Looking for the last set-up",
             look,
             self._use_session,
-            beside=self.answered.emit,
+            show_answer=self.answered.emit,
             kind=CAUSE,
         )
 
@@ -93,7 +93,7 @@ class Setups(QObject):
         if unlike := workspace.check_size():
             self.answered.emit(f"{PROBLEM} {unlike}")
             return
-        workspace.measure(beside=self.answered.emit)
+        workspace.measure(show_answer=self.answered.emit)
         workspace.action_requested.emit("step_surface")
 
 

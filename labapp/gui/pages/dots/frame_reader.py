@@ -120,12 +120,12 @@ def carry_on(page: Page, seen: DotsState, most: int | None, answer: Message) -> 
             return
         page.confirm(words, answer)
         if not why_not_measurable(session):
-            workspace.measure(list(corrections), beside=page.answer.setText)
+            workspace.measure(list(corrections), show_answer=page.answer.setText)
 
     page.start_task(
         "Carrying on",
         lambda control: presenter.carry(session, seen, most, control),
         finished,
-        beside=answer,
+        answer=answer,
         once=True,
     )

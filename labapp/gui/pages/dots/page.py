@@ -302,7 +302,7 @@ class DotsPage(Page):
             self._before = before  # edits before the fit is done are compared as one
         done = self.workspace.attempt(
             lambda session: session.correct({seen.frame: edit()}, f"{label}, frame {seen.frame}"),
-            beside=partial(setattr, self.editor, "refusal"),
+            show_answer=partial(setattr, self.editor, "refusal"),
         )
         if not done:
             self._before = before

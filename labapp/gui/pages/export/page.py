@@ -200,7 +200,7 @@ class ExportPage(Page):
     def measure_again(self) -> None:
         """Measure the chosen frames that are unmeasured or stale."""
         if self.plan is not None:
-            self.workspace.measure(self.plan.again.tolist(), beside=self._say)
+            self.workspace.measure(self.plan.again.tolist(), show_answer=self._say)
 
     def export(self) -> None:
         """Export the ticked items in the background."""
@@ -228,7 +228,7 @@ class ExportPage(Page):
 
         self.written = None
         self._writing = self.workspace.tasks.start(
-            f"Exporting to {folder.name}", work, done, beside=self._say, kind="Exporting"
+            f"Exporting to {folder.name}", work, done, show_answer=self._say, kind="Exporting"
         )
         self._show_state()
 

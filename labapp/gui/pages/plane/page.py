@@ -286,7 +286,7 @@ class PlanePage(Page):
             return board_pdf(BOARDS[name]) if is_pdf else board_svg(BOARDS[name]).encode()
 
         if self.workspace.run_or_report(
-            lambda: write_file(path, content()), beside=self.saved.setText
+            lambda: write_file(path, content()), show_answer=self.saved.setText
         ):
             self.confirm(f"Saved in {path}: print it at 100 %", self.saved)
 

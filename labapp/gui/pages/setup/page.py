@@ -260,7 +260,7 @@ class SetupPage(Page):
         return field
 
     def _use_defaults(self) -> None:
-        if self.workspace.attempt(presenter.put_usual, beside=self.answer.setText):
+        if self.workspace.attempt(presenter.put_usual, show_answer=self.answer.setText):
             self.confirm("Defaults entered where nothing was; measure what is still grey")
 
     def _choose_load(self) -> None:

@@ -330,7 +330,7 @@ class SurfacePage(Page):
             self.confirm(f"Saved in {path}", self.saved)
 
         title = f"Writing {path.name}"
-        self.start_task(title, work, done, kind="Film", beside=self.saved, once=True)
+        self.start_task(title, work, done, kind="Film", answer=self.saved, once=True)
 
     def toggle_scale(self) -> None:
         """Switch between true heights and the previous exaggeration."""

@@ -165,7 +165,7 @@ class SurfacePanel:
             self._measure(self.workspace.session.frames.tolist())
 
     def _measure(self, frames: list[int] | None) -> None:
-        self.workspace.measure(frames, beside=self._answer.setText)
+        self.workspace.measure(frames, show_answer=self._answer.setText)
 
     def stop(self) -> None:
         """Stop measuring."""
@@ -177,7 +177,7 @@ class SurfacePanel:
             lambda session: session.set_settings(
                 with_scheme(session.settings, name), f"scheme {SCHEMES[name].title}"
             ),
-            beside=self._answer.setText,
+            show_answer=self._answer.setText,
         )
 
     def _choose_correspondence(self, choice: str) -> None:
@@ -186,5 +186,5 @@ class SurfacePanel:
                 replace(session.settings, correspondence=choice),  # type: ignore[arg-type]
                 f"correspondence {choice}",
             ),
-            beside=self._answer.setText,
+            show_answer=self._answer.setText,
         )
