@@ -87,6 +87,12 @@ def computed_are(measures: Measures) -> float:
     return own if np.isfinite(own) else measures.are_mm
 
 
+def scheme_errors(match: Match, rig: Rig, cap: Pool, scheme: str) -> tuple[float, float, float]:
+    """`relative_errors` and `computed_are` of a reconstruction; or `CannotMeasure`."""
+    measures = measure_surface(reconstruct(match, rig, circle_settings(scheme)), match, rig)
+    return *relative_errors(measures, cap), computed_are(measures)
+
+
 def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: str) -> FloatArray:
     """`ERRORS` of one reconstruction, shape (4,); NaN if the scheme finds no surface."""
     try:

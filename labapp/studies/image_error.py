@@ -15,9 +15,8 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints
-from labapp.core.pipeline import Measurement, reconstruct
+from labapp.core.pipeline import Measurement
 from labapp.core.pipeline import measure as measure_frame
-from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import exact_match
@@ -25,12 +24,7 @@ from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool, spherical_cap
 from labapp.simulation.render import Look, RenderedFrame, render
 from labapp.studies import SCHEME_NAMES
-from labapp.studies.error_analysis import (
-    circle_settings,
-    computed_are,
-    relative_errors,
-    trace_once,
-)
+from labapp.studies.error_analysis import circle_settings, scheme_errors, trace_once
 from labapp.studies.parameter_deviation import KnownPool, nominal
 from labapp.studies.tables import Cell, Table
 from labapp.text import pluralize
@@ -141,11 +135,9 @@ def _frame_errors(task: tuple[Pool, Rig, int, tuple[str, ...]]) -> FrameErrors:
 
 def _sizes(known: KnownPool, scheme: str) -> FloatArray:
     try:
-        made = reconstruct(known.match, known.rig, circle_settings(scheme))
+        return np.array(scheme_errors(known.match, known.rig, known.cap, scheme))
     except CannotMeasure:
         return np.full(3, np.nan)
-    measures = measure_surface(made, known.match, known.rig)
-    return np.array([*relative_errors(measures, known.cap), computed_are(measures)])
 
 
 def _off(seen: Measurement, frame: RenderedFrame) -> tuple[FloatArray, int]:

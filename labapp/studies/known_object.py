@@ -9,13 +9,11 @@ import math
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
-from labapp.core.pipeline import reconstruct
-from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.simulation.pools import Pool, spherical_cap
 from labapp.studies import SCHEME_NAMES
-from labapp.studies.error_analysis import circle_settings, computed_are, relative_errors
+from labapp.studies.error_analysis import scheme_errors
 from labapp.studies.tables import Cell, Table
 
 LARGEST_MM = 30.0
@@ -55,15 +53,11 @@ def known_object_table(match: Match, rig: Rig, cap: Pool) -> Table:
     rows: list[dict[str, Cell]] = []
     diameter_mm, height_mm = cap.footprint.width_mm, cap.peak_mm
     for scheme in SCHEME_NAMES:
-        status, are_mm, height, diameter = "ok", math.nan, math.nan, math.nan
+        status, height, diameter, are_mm = "ok", math.nan, math.nan, math.nan
         try:
-            made = reconstruct(match, rig, circle_settings(scheme))
+            height, diameter, are_mm = scheme_errors(match, rig, cap, scheme)
         except CannotMeasure as why:
             status = why.status
-        else:
-            measures = measure_surface(made, match, rig)
-            height, diameter = relative_errors(measures, cap)
-            are_mm = computed_are(measures)
         rows.append(
             {
                 "scheme": scheme,

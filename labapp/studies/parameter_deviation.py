@@ -21,12 +21,10 @@ from labapp.core.geometry.uncertainty import (
     covariance_of,
 )
 from labapp.core.match import Match
-from labapp.core.pipeline import reconstruct
-from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool
-from labapp.studies.error_analysis import circle_settings, relative_errors
+from labapp.studies.error_analysis import scheme_errors
 from labapp.studies.tables import Table
 
 _CALIBRATED_IN_THE_TEXT = (
@@ -143,10 +141,9 @@ def moved_errors(task: tuple[KnownPool, FloatArray, str]) -> FloatArray:
     known, offset, scheme = task
     match, rig = move(known.match, known.rig, known.uncertainty.axes, offset)
     try:
-        measures = measure_surface(reconstruct(match, rig, circle_settings(scheme)), match, rig)
+        return np.array(scheme_errors(match, rig, known.cap, scheme)[:2])
     except CannotMeasure:
         return np.full(2, np.nan)
-    return np.array(relative_errors(measures, known.cap))
 
 
 def deviation_table(found: dict[tuple[str, str], ParameterDeviation]) -> Table:
