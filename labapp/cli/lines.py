@@ -17,7 +17,7 @@ from labapp.cli.shared import (
     finite,
     print_above,
     progress_bar,
-    warned,
+    show_warnings,
     writable_folder,
 )
 from labapp.errors import InputError, os_errors_as_input
@@ -67,7 +67,7 @@ def lines(
     from labapp.media import open_source
     from labapp.run.runner import select_frames
 
-    bench = warned(read_line_setup(setup))
+    bench = show_warnings(read_line_setup(setup))
     follow = follow or bench.rig.pattern.rows == 1
     current = None if signals is None else _current(signals, start, follow)
     with open_source(source) as recording:

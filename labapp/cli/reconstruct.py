@@ -32,7 +32,7 @@ from labapp.cli.shared import (
     print_above,
     progress_bar,
     progress_sink,
-    warned,
+    show_warnings,
 )
 from labapp.files import as_bytes, write_file
 
@@ -185,7 +185,7 @@ def _measure_recording(
     from labapp.run.measurers import ColdMeasurer, RecordingMeasurer, stretch_pools
     from labapp.run.runner import provenance, run, select_frames, with_setup_check
 
-    setup = warned(read_setup(setup_path))
+    setup = show_warnings(read_setup(setup_path))
     summary, record = Summary(), ResidualRecord(setup.rig)
     with open_source(source_path) as source, progress_bar() as progress:
         for warning in source.warnings:

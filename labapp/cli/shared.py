@@ -233,7 +233,7 @@ def print_above(progress: Progress, text: str) -> None:
     progress.console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
 
 
-def warned(setup: Setup) -> Setup:
+def show_warnings(setup: Setup) -> Setup:
     """Print a warning on stderr for each unusual value of a set-up, and return it."""
     for warning in setup.warnings:
         typer.echo(f"warning: {warning}", err=True)

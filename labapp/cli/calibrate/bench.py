@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING_MEASURED, check_distinct, check_target, warned
+from labapp.cli.shared import NOTHING_MEASURED, check_distinct, check_target, show_warnings
 from labapp.errors import InputError
 from labapp.files import write_file
 from labapp.text import csv_text, pluralize
@@ -65,7 +65,7 @@ def calibrate_bench(
     text = read_setup_text(setup)
     parse_setup(text, setup)
     before = unchecked_setup(text, setup)
-    known = warned(parse_setup(before, setup))
+    known = show_warnings(parse_setup(before, setup))
     mirrors = [parse_mirror(one) for one in mirror or []]
     if predict:
         if pictures or free or use or out is not None:

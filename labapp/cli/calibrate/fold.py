@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from labapp.cli.shared import finite, warned
+from labapp.cli.shared import finite, show_warnings
 from labapp.errors import InputError
 
 Vector = tuple[float, float, float]
@@ -54,7 +54,7 @@ def calibrate_fold(
         raise InputError("--point", "point", point, "three numbers (mm)")
     if not (all(map(math.isfinite, normal)) and any(normal)):
         raise InputError("--normal", "normal", normal, "three numbers that are not all 0")
-    rig = warned(read_setup(setup)).rig
+    rig = show_warnings(read_setup(setup)).rig
     assert rig.uncertainty is not None
     mirror = FoldingMirror(np.array(point), np.array(normal))
     pose = mirror.image_of(rig.imaging_plane).pose

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from labapp.cli.calibrate.bench import mirror_picture
-from labapp.cli.shared import NOTHING_MEASURED, check_distinct, check_target, warned
+from labapp.cli.shared import NOTHING_MEASURED, check_distinct, check_target, show_warnings
 from labapp.errors import InputError
 from labapp.files import write_file
 from labapp.text import pluralize
@@ -50,7 +50,7 @@ def calibrate_pattern(
     from labapp.core.geometry.patterns import MEASURED
     from labapp.core.values import CannotMeasure
 
-    known = warned(read_setup(setup))
+    known = show_warnings(read_setup(setup))
     _check_options(setup, pictures, height, out, use)
     check_target(out, ".csv")
     try:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from labapp.cli.shared import warned
+from labapp.cli.shared import show_warnings
 from labapp.errors import InputError
 
 SetupToChange = Annotated[
@@ -26,6 +26,6 @@ def write_values(setup: Path | None, values: Mapping[str, Mapping[str, object]])
     update_setup(setup, values)
     typer.echo(f"Written to [{'], ['.join(values)}] of {setup.absolute()}")
     try:
-        warned(read_setup(setup))
+        show_warnings(read_setup(setup))
     except InputError as lacking:
         typer.echo(f"It is not complete yet:\n{lacking}", err=True)

@@ -39,7 +39,7 @@ from labapp.cli.shared import (
     progress_shown,
     report_stale_results,
     session_command,
-    warned,
+    show_warnings,
 )
 from labapp.core.schemes import scheme_words
 from labapp.errors import InputError, printable
@@ -117,7 +117,7 @@ def new(
     from labapp.session.record import Record
     from labapp.session.session import Session
 
-    text = None if setup is None else warned(read_setup(setup, lines=True)).text
+    text = None if setup is None else show_warnings(read_setup(setup, lines=True)).text
     record = Record(
         title=title,
         operator=operator,
@@ -147,7 +147,7 @@ def set_setup(
     from labapp.config.setup import read_setup
     from labapp.session.session import Session
 
-    text = warned(read_setup(setup, lines=True)).text
+    text = show_warnings(read_setup(setup, lines=True)).text
     with Session.open(file) as session, report_stale_results(session):
         same = session.setup_text == text
         session.set_setup(text)

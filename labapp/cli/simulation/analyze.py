@@ -13,7 +13,7 @@ from labapp.cli.shared import (
     command_group,
     progress_shown,
     results_folder,
-    warned,
+    show_warnings,
     writable_folder,
 )
 from labapp.errors import InputError
@@ -174,7 +174,7 @@ def frame(
     from labapp.studies.frame_comparison import comparison_tables, shape_table
     from labapp.studies.known_object import known_cap, known_object_table
 
-    known = warned(read_setup(setup))
+    known = show_warnings(read_setup(setup))
     cap = None if known_object is None else known_cap(*known_object)
     with open_source(source) as recording:
         if number >= len(recording):
@@ -211,7 +211,7 @@ def budget(
     """
     from labapp.config.setup import read_setup
 
-    read = None if setup is None else warned(read_setup(setup))
+    read = None if setup is None else show_warnings(read_setup(setup))
     pool = expected_pool(width, length, height)
     folder = results_folder(out)
     _check_tables(folder, "error_budget")
