@@ -53,10 +53,6 @@ WAITS = {
 }
 """State of a camera that takes frames only when triggered, by its trigger."""
 
-_Work = tuple[str, Callable[[], CameraFrame | None], Callable[[CameraFrame], None], float, float]
-"""Work of a thread: its name, the source of the next frame, the function for a frame, the minimum
-interval, and the pause as a multiple of the duration."""
-
 
 def choices(found: list[CameraInfo]) -> list[tuple[str, str]]:
     """(id, text) of the available cameras: the connected ones and the simulated one."""
@@ -142,8 +138,8 @@ class Live:
                 self.feed = feed
                 self._recorders = [self._recorder(feed)]
                 show, judge = (partial(newest_of, each) for each in (self._to_show, self._to_judge))
-                self._begin(("dots", show, self._find_quickly, SHOW_S, 1.0))
-                self._begin(("verdict", judge, self._judge, LOOK_S, 1.0))
+                self._begin("dots", show, self._find_quickly, SHOW_S)
+                self._begin("verdict", judge, self._judge, LOOK_S)
                 self._begin_measuring(feed)
                 return
         feed.stop()
@@ -219,37 +215,40 @@ class Live:
         given = (self.setup, self._settings, feed.bit_depth, self._limits)
         self.watch = LiveWatch(self.name, *given, self._say)
         # No pause: the work runs in a process, and skipped frames would lengthen the steps.
-        self._begin(("figures", self.watch.next_frame, self.watch.measure, 0.0, 0.0))
+        self._begin("figures", self.watch.next_frame, self.watch.measure, 0.0, rest=0.0)
 
-    def _begin(self, work: _Work) -> None:
-        name = f"live {work[0]}"
-        worker = threading.Thread(target=self._work_on, args=work, name=name, daemon=True)
-        self._workers.append(worker)
-        worker.start()
-
-    def _work_on(
+    def _begin(
         self,
         what: str,
-        following: Callable[[], CameraFrame | None],
+        next_frame: Callable[[], CameraFrame | None],
         work: Callable[[CameraFrame], None],
         every_s: float,
-        rest: float,
+        rest: float = 1.0,
     ) -> None:
-        """Call a function with one frame after the other."""
-        try:
-            while not self._closing.is_set():
-                frame = following()
-                if frame is None:
-                    self._closing.wait(IDLE_S)
-                    continue
-                began_s = time.monotonic()
-                work(frame)
-                took_s = time.monotonic() - began_s
-                self._closing.wait(max(every_s - took_s, rest * took_s))
-        except Exception as error:
-            logging.getLogger(NAME).exception("live %s", what)
-            words = f"a fault in the program has ended its {what}: {error!r}"
-            self._events.put(Event(self.name, "warning", words))
+        """Start a thread that calls ``work`` with one frame after the other.
+
+        ``every_s`` is the minimum interval, ``rest`` the pause as a multiple of the duration.
+        """
+
+        def run() -> None:
+            try:
+                while not self._closing.is_set():
+                    frame = next_frame()
+                    if frame is None:
+                        self._closing.wait(IDLE_S)
+                        continue
+                    began_s = time.monotonic()
+                    work(frame)
+                    took_s = time.monotonic() - began_s
+                    self._closing.wait(max(every_s - took_s, rest * took_s))
+            except Exception as error:
+                logging.getLogger(NAME).exception("live %s", what)
+                words = f"a fault in the program has ended its {what}: {error!r}"
+                self._events.put(Event(self.name, "warning", words))
+
+        worker = threading.Thread(target=run, name=f"live {what}", daemon=True)
+        self._workers.append(worker)
+        worker.start()
 
     def _find_quickly(self, frame: CameraFrame) -> None:
         self._newest.append(LiveFrame(frame, self._dots.find_quickly(frame.image)))
