@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -40,8 +40,16 @@ FILM_FRAMES, FILM_HZ, FILM_PERIODS = 48, 24.0, 3
 FILM_SWING = 0.3
 """Amplitude in the film, as a fraction of the pool's largest height."""
 
-MeasuredSurface = tuple[int, float, Surface, Boundary, Mapping[str, float]]
-"""Frame, time (s), surface, boundary, and sizes by name."""
+
+class MeasuredSurface(NamedTuple):
+    """A frame with a surface."""
+
+    frame: int
+    time_s: float
+    surface: Surface
+    boundary: Boundary
+    sizes: Mapping[str, float]
+    """Sizes by name, as in `Measures`."""
 
 
 def measured_of(results: Iterable[FrameResult]) -> Iterator[MeasuredSurface]:
@@ -57,7 +65,9 @@ def measured_of(results: Iterable[FrameResult]) -> Iterator[MeasuredSurface]:
         if found is not None and sizes is not None:
             if one.time_s is None:
                 raise no_time_base()
-            yield one.frame, one.time_s, found.unbounded, found.boundary, vars(sizes)
+            yield MeasuredSurface(
+                one.frame, one.time_s, found.unbounded, found.boundary, vars(sizes)
+            )
 
 
 def no_time_base() -> InputError:

@@ -78,9 +78,9 @@ def measured_series(
     """
     times: list[float] = []
     rows: list[dict[str, float]] = []
-    for _, time_s, _, _, sizes in measured:
-        times.append(time_s)
-        rows.append(dict(sizes))
+    for one in measured:
+        times.append(one.time_s)
+        rows.append(dict(one.sizes))
     if not rows:
         raise InputError(name, "frames", "none with a surface", "some that were measured")
     columns = {key: np.array([row.get(key, np.nan) for row in rows], float) for key in rows[0]}

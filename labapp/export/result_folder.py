@@ -70,7 +70,7 @@ def measured_in(folder: Path) -> Iterator[MeasuredSurface]:
         }
         boundary = _boundary(folder / "boundary.csv", list(outline[1]))
         surface = _surface(folder / f"surface_{int(frame):06d}.csv", boundary)
-        yield int(frame), time_s, surface, boundary, sizes
+        yield MeasuredSurface(int(frame), time_s, surface, boundary, sizes)
 
 
 def _rows(path: Path) -> Iterator[dict[str, str]]:
