@@ -17,7 +17,7 @@ from tests.gui.conftest import SAMPLES, CopySample
 LASER = "[laser]\nprojection_angle_deg = 31.14\ndistance_mm = 31.48\n"
 PATTERN = "[pattern]\nrows = 19\ncolumns = 19\ninter_beam_angle_deg = 0.77\n"
 TYPED = "the electrode, the imaging plane"
-CALIBRATE = "calibrate the picture (step Imaging plane)"
+CALIBRATE = "calibrate the picture (step 3)"
 
 
 @pytest.mark.parametrize(
@@ -110,3 +110,20 @@ def test_recording_without_any_surface_needs_attention(tmp_path: Path) -> None:
     assert {step_states[key].mark for key in ("dots", "surface", "trends", "export")} == {
         Mark.ATTENTION
     }
+
+
+def test_damaged_calibration_needs_attention_and_leaves_the_other_steps(
+    copy_sample: CopySample,
+) -> None:
+    with Session.open(copy_sample("gtaw")) as session:
+        before = states(session)
+        with session._database.transaction() as connection:
+            connection.execute(
+                "UPDATE document SET content = x'4c414231' WHERE kind = 'plane-calibration'"
+            )
+    with Session.open(session.path) as session:
+        after = states(session)
+    assert after["plane"].mark is Mark.ATTENTION
+    assert "plane-calibration" in after["plane"].why
+    untouched = set(before) - {"laser", "plane"}  # both compare the calibrations with the set-up
+    assert {key: after[key] for key in untouched} == {key: before[key] for key in untouched}

@@ -71,7 +71,8 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
     for problem in problems:
         part, _, key = problem.field.partition(".")
         if part == "image_calibration":
-            calibrate = ["calibrate the picture (step Imaging plane)"]
+            number = next(k for k, step in enumerate(STEPS, 1) if step.key == "plane")
+            calibrate = [f"calibrate the picture (step {number})"]
         elif part not in PARTS:
             wrong.append(f"take out {problem.field}: {problem.expected}")
         elif problem.value == "unknown key":
@@ -414,9 +415,25 @@ def states(session: Session | None, seen: Overview | None = None) -> dict[str, S
     """State of every step by its key; ``seen`` is the session's overview if already available."""
     if session is None:
         return {step.key: State(Mark.TODO, "Open or make a session first") for step in STEPS}
-    facts, bare = _facts(session, seen), session.recording is None
-    first = State(Mark.TODO, "Import a recording first")
-    return {step.key: first if bare and step.needs_frames else step.state(facts) for step in STEPS}
+    try:
+        facts = _facts(session, seen)
+    except InputError as error:
+        return {step.key: _damaged(error) for step in STEPS}
+    return {step.key: _state(step, facts) for step in STEPS}
+
+
+def _state(step: Step, facts: Facts) -> State:
+    """State of a step; its damaged data do not hide the states of the others."""
+    if step.needs_frames and facts.session.recording is None:
+        return State(Mark.TODO, "Import a recording first")
+    try:
+        return step.state(facts)
+    except InputError as error:
+        return _damaged(error)
+
+
+def _damaged(error: InputError) -> State:
+    return State(Mark.ATTENTION, f"Damaged in the file: {error.field}: {error.value}")
 
 
 def lead(

@@ -351,7 +351,7 @@ class MainWindow(QMainWindow):
             self.frame_statuses = frame_statuses(seen)
             self.timeline.set_frames(seen.frame, seen.time_s, self.frame_statuses)
         self.timeline.set_frame(self.workspace.frame)
-        self._states = self.workspace.run_or_report(lambda: states(session, seen)) or states(None)
+        self._states = states(session, seen)
         own = {key: page.state(self._states[key]) for key, page in self.pages.items()}
         steps = [step.of(session) for step in STEPS]
         self.step_list.show_titles(steps)

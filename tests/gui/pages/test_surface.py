@@ -433,3 +433,14 @@ def test_chart_shows_values_at_the_pointer_and_can_be_saved(
     assert "<image" not in svg
     assert QImage(str(tmp_path / "chart.png")).width() == Paper(80, 150).width_px
     assert not write_plot(tmp_path / "nowhere" / "chart.png", chart, chart.plot, Paper())
+
+
+def test_damaged_result_can_be_measured_again(page: SurfacePage, qtbot: QtBot) -> None:
+    with page.session._database.transaction() as connection:
+        connection.execute("UPDATE detail SET content = substr(content, 1, 900) WHERE result = 1")
+    page.refresh()
+    assert page.surface_state.state == "failed"
+    assert "Measure the frame again" in page.side.status.text()
+    assert "step Dots" not in page.side.status.text()
+    page.side.one.click()
+    qtbot.waitUntil(lambda: page.surface_state.state == "measured")

@@ -59,7 +59,7 @@ from labapp.gui.widgets.layouts import column_of, fill, hbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 from labapp.session.results.measured import scheme_name
-from labapp.text import HEIGHT_SIGMA_OF
+from labapp.text import HEIGHT_SIGMA_OF, capitalized
 
 LEAST_PLAN_WIDTH = 100
 """Minimum width at which the section line can be dragged beside the section's fields."""
@@ -259,7 +259,8 @@ class SurfacePage(Page):
         try:
             self.surface_state = shown(self.session, self.workspace.frame)
         except InputError as error:
-            self.surface_state = SurfaceState(None, "failed", str(error))
+            words = f"{capitalized(error.field)}: {error.value}. Measure the frame again."
+            self.surface_state = SurfaceState(None, "failed", words)
         self.side.show(self.surface_state)
         self._show_options()
         lines = self.session.has_lines

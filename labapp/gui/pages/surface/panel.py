@@ -112,7 +112,8 @@ class SurfacePanel:
         for field in (self.scheme, self.correspondence):  # lines have neither
             for widget in (field, field.label):
                 widget.setVisible(not session.has_lines)
-        dots = surface_state.state == "failed" and not session.has_lines
+        failed = surface_state.state == "failed" and surface_state.result is not None
+        dots = failed and not session.has_lines
         remedy = " Its dots can be corrected in step Dots." if dots else ""
         status = f"{SIGNS[surface_state.state]} {surface_state.words}{remedy}"
         about_setup = surface_state.setup_words
