@@ -513,6 +513,19 @@ def test_split_merge_and_reference(
     assert editor.correction.lattice.reference == (6, 8)
 
 
+def test_frame_without_dots_does_not_ask_for_the_reference(
+    page: DotsPage, qtbot: QtBot, tmp_path: Path
+) -> None:
+    dark, path = tmp_path / "dark.npy", tmp_path / "dark.labsession"
+    np.save(dark, np.zeros((1, 640, 480), np.uint8))
+    with Session.create(path) as session:
+        session.import_recording(dark)
+    show(page, qtbot, path, 0)
+    qtbot.waitUntil(lambda: page.seen is not None and bool(page.seen.why))
+    assert "blank" in page.dots_panel.seen.text()
+    assert "press Reference" not in page.dots_panel.seen.text()
+
+
 def test_reference_button_waits_for_a_click(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:

@@ -321,6 +321,15 @@ def test_export_button_is_disabled_with_the_reason(page: ExportPage) -> None:
     assert not page._boxes["solid"].isEnabled()
 
 
+def test_no_frame_can_be_measured_from_here_without_a_setup(page: ExportPage) -> None:
+    page.workspace.attempt(lambda session: session.update_setup({"laser": {"distance_mm": None}}))
+    assert page.again_button.isVisibleTo(page.panel)
+    assert not page.again_button.isEnabled()
+    assert "set-up is not complete" in page.again_button.toolTip()
+    page.workspace.attempt(lambda session: session.update_setup({"laser": {"distance_mm": 32.0}}))
+    assert page.again_button.isEnabled()
+
+
 def test_export_is_of_the_scheme_in_view(page: ExportPage, tmp_path: Path) -> None:
     page.workspace.changed.disconnect()  # as if the window delayed the display of a change
     page.folder.set_value(str(tmp_path / "out"))

@@ -191,7 +191,7 @@ class DotsPage(Page):
         pending = "fitting…" if self.refit.pending else "" if stands else "–"
         why = seen.why or recording_gone(session)
         dots = seen.correction
-        if seen.why and dots is not None and dots.lattice.reference is None:
+        if seen.why and dots is not None and len(dots.dots) and dots.lattice.reference is None:
             why = f"{why}. {NO_REFERENCE}"
         self._show_lead()
         self.dots_panel.show_frame(

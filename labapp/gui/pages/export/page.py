@@ -32,6 +32,7 @@ from labapp.gui.pages.export.presenter import (
 )
 from labapp.gui.pages.export.sizes import estimated_bytes
 from labapp.gui.pages.page import Page
+from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.tasks import DONE, PROBLEM, Control, Task
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, whole
@@ -150,7 +151,10 @@ class ExportPage(Page):
         self.answer.setText(wrong or ready)
         again = len(made.again) > 0 and not self.workspace.session.read_only
         self.again_button.setVisible(again)
-        self.again_button.setEnabled(again and not measuring)
+        offer(
+            self.again_button,
+            "Measuring…" if measuring else why_not_measurable(self.workspace.session),
+        )
         self.again_button.setText("Measuring…" if measuring else f"Measure {len(made.again)} now")
         unwritten = "" if self.written is not None else "Nothing has been exported yet"
         offer(self.open_button, unwritten)
