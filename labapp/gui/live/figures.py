@@ -95,9 +95,9 @@ def standing_text(stands: Standing, limits: Limits, name: str) -> str:
     """Short text, after a sign, that compares a size with its limits."""
     low, high = limits.of(name)
     if stands == "low":
-        return f"▲ below {low:g}"
+        return f"▲ below {low:g} mm"
     if stands == "high":
-        return f"▲ above {high:g}"
+        return f"▲ above {high:g} mm"
     return {
         "": "",
         "unknown": "? not known",

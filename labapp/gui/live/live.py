@@ -29,7 +29,7 @@ from labapp.run.live_queue import newest_of
 from labapp.run.live_trend import RATE_S
 from labapp.run.live_watch import LiveWatch
 from labapp.session.session import Session
-from labapp.text import format_bytes, pluralize
+from labapp.text import capitalized, format_bytes, pluralize
 
 SIMULATED = "simulated"
 """Id of the simulated camera."""
@@ -349,7 +349,7 @@ class Live:
         if self.room_byte is not None and rate:
             room_s = self.room_byte / (self._frame_byte * rate / self.plan.every)
             parts.append(f"room for {_lasting(room_s)} ({format_bytes(self.room_byte)})")
-        return "; ".join(parts)
+        return capitalized("; ".join(parts))
 
     # --- to do --------------------------------------------------------------------------------
 

@@ -79,13 +79,13 @@ class LiveTrends(QWidget):
         self.plots = PlotStack("Trends of the live pool")
         self.plots.area.setMinimumHeight(LEAST_PX)
         tip = "How much of the trend is shown"
-        self.last = whole("Shown, the last", 2, tip, int(TREND_S), unit="s", step=10)
+        self.last = whole("Show the last", 2, tip, int(TREND_S), unit="s", step=10)
         self.last.set_value(LAST_S)
         tip = (
             "How many frames in a row that cannot be measured raise an alarm, where there is any "
             "limit"
         )
-        self.unmeasured = whole("Alarm after, not measured", 1, tip, 10_000, unit="frames")
+        self.unmeasured = whole("Alarm if not measured for", 1, tip, 10_000, unit="frames")
         self.unmeasured.edited.connect(lambda value: self._keep(unmeasured=int(value)))
         self.fields = {
             (name, end): NumberField(
@@ -129,6 +129,7 @@ class LiveTrends(QWidget):
             grid.addWidget(plain_label(name.capitalize()), row, 0)
             for end in (0, 1):
                 grid.addWidget(self.fields[name, end], row, 1 + end)
+        grid.setRowStretch(grid.rowCount(), 1)  # on a low canvas they have the room of the plots
         return grid
 
     def resizeEvent(self, event: QResizeEvent) -> None:

@@ -80,7 +80,7 @@ def test_figures_show_their_verdict_and_unknown_if_not_measured():
     limits = Limits(width_mm=(6.0, 6.6), length_mm=(7.0, 8.0), height_mm=(0.301, None))
     shown = figures(live_result(), limits)
     assert [(f.value, f.sigma, f.verdict, f.look) for f in shown] == [
-        ("6.700", "± 0.030", "▲ above 6.6", "alarm"),
+        ("6.700", "± 0.030", "▲ above 6.6 mm", "alarm"),
         ("7.500", "± 0.040", "✓ within limits", "plain"),
         ("0.300", "± 0.003", "◆ at its limit", "plain"),
     ]
@@ -298,7 +298,7 @@ def test_alarm_is_shown_logged_recorded_and_acknowledged(
     assert not view.canvas.alarms.isVisible()
     Prepared.found = replace(OK, measures=replace(MEASURES, width_mm=7.1))
     qtbot.waitUntil(view.canvas.alarms.isVisible)
-    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n▲ above 6.9")
+    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n▲ above 6.9 mm")
     for column in (0, 1):
         colour = figure(page, 0, column).palette().color(QPalette.ColorRole.WindowText)
         assert colour == RED[is_dark(window.palette())]
