@@ -41,6 +41,26 @@ def test_measured_frame_is_shown_with_its_figures(session: Session) -> None:
     ]
 
 
+@pytest.mark.parametrize(("sample", "level"), [("gtaw", "Depth"), ("concave", "Height")])
+def test_level_of_the_work_piece_has_no_sigma(
+    copy_sample: CopySample, sample: str, level: str
+) -> None:
+    """A convex pool has no depth, and a concave one no height; that is not a lack of the scheme."""
+    with Session.open(copy_sample(sample)) as session:
+        rows = presenter.shown(session, int(session.frames[0])).sizes
+    row = next(each for each in rows if each.name == level)
+    assert row.texts[1:3] == ("0.000", "")
+    assert presenter.NO_SIGMA_OF_LEVEL in row.note
+    assert all(presenter.NO_SIGMA not in each.note for each in rows)
+
+
+def test_measured_frame_of_a_scheme_without_sigma_says_so(session: Session) -> None:
+    assert presenter.NO_SIGMA not in presenter.shown(session, 0).words
+    session.set_settings(presenter.with_scheme(session.settings, "ers"))
+    assert list(session.measure([0]))
+    assert presenter.NO_SIGMA in presenter.shown(session, 0).words
+
+
 def test_surface_is_marked_with_the_status_of_its_setup(session: Session) -> None:
     assert list(session.measure([4]))
     assert presenter.shown(session, 4).setup_words.startswith(SETUP_MARKS["entered"])

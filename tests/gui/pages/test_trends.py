@@ -42,9 +42,15 @@ def test_trends_of_the_sample(gtaw: Path) -> None:
     assert sure.value is not None
     assert 0.0 < sure.value < 0.019
     assert sure.texts[1] == with_sigma(0.293, sure.value).partition(" ± ")[2]  # two digits
-    assert shown.words == "30 of 30 frames count"
+    assert shown.words == "Fit: 30 of 30 frames count"
     assert shown.spectrum == ()
     assert shown.signals_words.startswith("None.")
+
+
+def test_trends_name_the_scheme_of_their_values(gtaw: Path) -> None:
+    with Session.open(gtaw) as session:
+        session.set_settings(replace(session.settings, scheme="ers"))
+        assert show(session, TrendOptions()).words.startswith("ERS: 0 of 30 frames count")
 
 
 def test_trends_of_a_concave_pool_show_its_depth(copy_sample) -> None:
@@ -60,7 +66,7 @@ def test_marks_show_the_status_of_frames(copy_sample) -> None:
         curve = show(session, TrendOptions()).curves[0]
         assert dict(zip(curve.key.tolist(), curve.mark.tolist(), strict=True))[2] == CORRECTED
         words = show(session, TrendOptions()).words
-        assert words == "3 of 6 frames count, 3 without a surface"
+        assert words == "Fit: 3 of 6 frames count, 3 without a surface"
         fit = replace(session.settings.fit, jerk=0.06)
         session.set_settings(replace(session.settings, fit=fit))
         shown = show(session, TrendOptions())

@@ -59,6 +59,8 @@ ERRORS = (
 
 NO_SIGMA = "This scheme gives no ±"
 
+NO_SIGMA_OF_LEVEL = "It is the level of the work piece, which has no ±"
+
 
 def with_scheme(settings: Settings, name: str) -> Settings:
     """Copy of settings with a scheme, given by its name in `SCHEMES`."""
@@ -194,6 +196,8 @@ def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]
             words += f" {EITHER_NUMBERS}"
     elif measurement.status == "followed":
         words = "The line is followed, but one line gives no surface. Its motion is in step Trends."
+    elif measurement.measures is not None and np.isnan(measurement.measures.width_sigma_mm):
+        words = f"Measured. {NO_SIGMA}."
     elif failed:
         reason = f": {measurement.reason}" if measurement.reason else ""
         words = f"No surface ({measurement.status}){reason}."
@@ -232,7 +236,7 @@ def size_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
         ResultRow(
             name,
             getattr(measures, value),
-            getattr(measures, of_sigma),
+            getattr(measures, of_sigma) or None,
             unit,
             note=f"{note}. {_sigma_words(measures, value, unit)}",
         )
@@ -245,8 +249,8 @@ def _sigma_words(measures: Measures, value: str, unit: str) -> str:
     total, level, setup = (
         getattr(measures, sigma_name(value, part), np.nan) for part in ("", "level", "setup")
     )
-    if not np.isfinite(total):
-        return NO_SIGMA
+    if not total > 0:  # 0 or unknown
+        return NO_SIGMA_OF_LEVEL if np.isfinite(measures.width_sigma_mm) else NO_SIGMA
     if not np.isfinite(setup):
         return f"±: one σ, {HEIGHT_SIGMA_OF}"
     noise = np.sqrt(max(total**2 - np.nan_to_num(level) ** 2 - setup**2, 0.0))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from labapp.core.lines.track import oscillation_frequency
+from labapp.core.schemes import scheme_words
 from labapp.core.values import FloatArray, IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow
@@ -20,7 +21,7 @@ from labapp.session.results.line_trends import (
     TRACK_QUANTITIES,
     line_trend,
 )
-from labapp.session.results.measured import Overview
+from labapp.session.results.measured import Overview, scheme_name
 from labapp.session.results.trends import (
     LABELS,
     Trend,
@@ -81,7 +82,7 @@ class TrendsState:
     rows: tuple[ResultRow, ...]
     """Rows for each measure: mean ± standard deviation, range, and ± of the mean if known."""
     words: str
-    """Number of frames included, and reasons why others are not."""
+    """Scheme, number of frames included, and reasons why others are not."""
     setup_words: str
     """Text of the reliability of the set-up; empty if it is incomplete."""
     spectrum: tuple[Curve, ...]
@@ -138,7 +139,7 @@ def show(
         axis=axis,
         places=places,
         rows=tuple(row for course in courses for row in _rows(course)),
-        words=_counted(seen, course_of("height_mm")) + _without_shape(courses),
+        words=_counted(session, seen, course_of("height_mm")) + _without_shape(courses),
         setup_words=marked_setup_words(session.setup_status, session.setup_words),
         spectrum=found,
         spectrum_axis=spectrum_axis,
@@ -256,9 +257,10 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
     )
 
 
-def _counted(seen: Overview, course: Trend) -> str:
+def _counted(session: Session, seen: Overview, course: Trend) -> str:
     total, has = len(seen.frame), len(course.frame)
-    parts = [f"{int(course.counts.sum())} of {total} frames count"]
+    scheme = scheme_words()[scheme_name(session.settings)].title
+    parts = [f"{scheme}: {int(course.counts.sum())} of {total} frames count"]
     unmeasured = seen.status.count("")
     reasons = (
         (unmeasured, "not measured yet"),
