@@ -39,7 +39,7 @@ Look = Literal["plain", "alarm", "old"]
 
 FIRST = "Measuring the first frame: this takes some seconds…"
 NO_FRAMES = "No frames arrive at present; measuring the first one takes some seconds"
-NO_SETUP = "Sizes are shown here once the set-up is complete"
+NO_SETUP = "No sizes without a complete set-up"
 LINES = "Lines are not measured live: record them, and measure the recording"
 
 

@@ -426,7 +426,7 @@ class LiveView(QObject):
             rate_hz = set_to.rate_hz if set_to.trigger == "free" else None
             self.plan_fields.show_cost(frame_byte, rate_hz or live.rate_hz())
         if self._shown != (live.running is not None):
-            self._show_state()
+            self.workspace.changed.emit()  # the list of steps shows on every page that it records
 
     # --- widgets ------------------------------------------------------------------------------
 

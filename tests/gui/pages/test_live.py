@@ -25,9 +25,10 @@ from pytestqt.qtbot import QtBot
 from labapp.config.setup import read_setup
 from labapp.core.pipeline import Settings
 from labapp.gui.live import view as live_view
-from labapp.gui.live.figures import LINES, Figure, figures
+from labapp.gui.live.figures import LINES, NO_SETUP, Figure, figures
 from labapp.gui.live.live import SIMULATED, STATES, WAITS, Live, choices
 from labapp.gui.pages.capture.page import CapturePage
+from labapp.gui.shell.steps import Mark
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.theme import RED
 from labapp.gui.widgets.exposure import LINES_NOT_JUDGED
@@ -469,10 +470,10 @@ def test_figures_are_of_the_present_setup(
     assert abs(heights[1] - heights[0]) > 1e-4
     for _ in heights:
         window.workspace.undo()
-    assert view.figures.words.text().startswith("Sizes are shown here once")
+    assert view.figures.words.text().startswith(NO_SETUP)
     updates = view.updates
     qtbot.waitUntil(lambda: view.updates > updates + 3)
-    assert view.figures.words.text().startswith("Sizes are shown here once")
+    assert view.figures.words.text().startswith(NO_SETUP)
     window.workspace.redo()
     qtbot.waitUntil(lambda: view._result is not None)
 
@@ -616,12 +617,15 @@ def test_recording_continues_on_another_page_and_is_imported(
     frames, updates = live.takes[0].frames, page.live_view.updates
     qtbot.waitUntil(lambda: live.takes[0].frames > frames + 20)
     assert page.live_view.updates == updates  # the page is hidden
+    # The only sign of it on this page:
+    qtbot.waitUntil(lambda: window.step_list._states["capture"].mark is Mark.ATTENTION)
     assert window.menus.actions["record"].isEnabled()
     Hand(window).press(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
     session = window.workspace.session
     qtbot.waitUntil(lambda: session.recording is not None)
     assert len(session.frames) == live.takes[0].frames
     assert live.is_open
+    qtbot.waitUntil(lambda: window.step_list._states["capture"].mark is not Mark.ATTENTION)
     window.show_step("capture")
     assert page.title.text() == "Live: Simulated camera"
     qtbot.waitUntil(lambda: page.live_view.updates > updates + 2)

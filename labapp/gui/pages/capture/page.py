@@ -109,6 +109,9 @@ class CapturePage(Page):
     def state(self, found: State) -> State:
         """State of the step, which may have a chosen recording that is not yet imported."""
         session = self.workspace.session
+        if self.live_view.recording is not None:
+            message = "A recording is running: Ctrl+R or a pedal ends it"
+            return State(Mark.ATTENTION, message)
         if self.live_view.live is not None:
             message = "The camera is live: Space, Ctrl+R or a pedal starts and stops a recording"
             return State(Mark.READY, message)
