@@ -215,6 +215,21 @@ def test_damaged_session_is_reported(
     assert not tool.start_button.isEnabled()
 
 
+def test_closed_session_leaves_no_message(tool: DynamicsWindow, window: MainWindow) -> None:
+    assert tool.message.text()
+    window.do("close")
+    assert tool.message.text() == ""
+
+
+def test_frames_to_measure_are_named_only_if_there_are_enough(
+    window: MainWindow, copy_sample: CopySample
+) -> None:
+    assert window.files.open(copy_sample("blocked_rows"))
+    words = dynamics_presenter.impossible(window.workspace.session, window.workspace.overview())
+    assert "3 of 6" in words
+    assert "Measure more" not in words
+
+
 def test_too_few_frames_are_reported(window: MainWindow, copy_sample: CopySample) -> None:
     assert window.files.open(copy_sample("gtaw"))
     overview = window.workspace.overview()
@@ -223,7 +238,9 @@ def test_too_few_frames_are_reported(window: MainWindow, copy_sample: CopySample
     assert dynamics_presenter.impossible(session, overview) == ""
     few = {**overview.measures, "height_mm": np.where(overview.frame < 15, 0.3, np.nan)}
     object.__setattr__(overview, "measures", few)
-    assert "15 of 30" in dynamics_presenter.impossible(session, overview)
+    words = dynamics_presenter.impossible(session, overview)
+    assert "15 of 30" in words
+    assert "Measure more" in words
 
 
 def test_tables_show_the_simulated_values() -> None:
@@ -231,6 +248,9 @@ def test_tables_show_the_simulated_values() -> None:
     rows = {str(row[0]): row for row in dynamics_presenter.modes_table(analysis).rows}
     assert str(rows["(0, 1)"][2]).startswith("31.0")
     assert str(rows["(1, 1)"][2]).startswith("47.0")
+    shares = {row[1] for row in rows.values()}
+    assert "<1%" in shares
+    assert "0%" not in shares  # a mode with figures has a share
     response = dynamics_presenter.responses_table(analysis).rows
     assert {row[1] for row in response} == {"Width (mm)"}
     assert len(response) == 4  # the first order does not overshoot

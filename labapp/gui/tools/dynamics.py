@@ -206,6 +206,7 @@ class DynamicsWindow(ToolWindow):
         self.tasks.cancel_all()
         self._turn.stop()
         self.drawn, self._of = None, None
+        self.say("")
         self.tabs.hide()
 
     def save(self, folder: Path) -> None:

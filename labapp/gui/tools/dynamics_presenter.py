@@ -77,7 +77,7 @@ def impossible(session: Session | None, seen: Overview | None) -> str:
     if seen is None:
         return "The results of the session cannot be read."
     if session.has_lines:
-        return "The session is of a line pattern, which has no surface to analyse over time."
+        return "Line patterns are not analysed here: step Trends shows how their lines change."
     if not np.isfinite(seen.time_s).all():
         return (
             "The frame rate is unknown, so there are no frequencies: import the recording with "
@@ -85,9 +85,10 @@ def impossible(session: Session | None, seen: Overview | None) -> str:
         )
     count = int((np.isfinite(seen.measures["height_mm"]) & ~seen.stale).sum())
     if count < FEWEST:
+        more = " Measure more of them (F5)." * (len(seen.frame) >= FEWEST)
         return (
             f"Too few frames: {count} of {len(seen.frame)} have a surface that is up to date, and "
-            f"{FEWEST} are needed. Measure more of them (F5)."
+            f"{FEWEST} are needed.{more}"
         )
     return ""
 
@@ -148,7 +149,8 @@ def modes_table(found: Dynamics) -> Table:
             with_sigma(*(scale * x for x in figures[name])) if figures else "–"
             for name, scale in zip(names, scales, strict=True)
         ]
-        rows.append((one.name, f"{one.share:.0%}", *cells))
+        share = f"{one.share:.0%}" if one.share >= 0.005 else "<1%"
+        rows.append((one.name, share, *cells))
     columns = ("Mode", "Share", "Frequency (Hz)", "Amplitude (µm)", "Phase (°)", "Damping (1/s)")
     return Table("modes", "Modes and their strongest oscillation, with ±", columns, tuple(rows))
 
