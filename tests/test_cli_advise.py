@@ -68,7 +68,7 @@ def test_options_override_the_file_and_no_solution_is_reported(labapp: Run, tmp_
     code, stdout, stderr = labapp("advise", file, "--height", "0.5:0.6", "--quick", "--out", out)
     assert code == 1, stderr
     assert "No set-up within these limits" in stdout
-    assert "dots on the plate, above and below" in stdout
+    assert "dots on the imaging plane, above and below" in stdout
     assert "too little" in (out / "advice.md").read_text("utf-8")
     assert not (out / "setup.toml").exists()
 

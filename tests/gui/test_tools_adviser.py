@@ -141,7 +141,7 @@ def test_impossible_request_is_explained(adviser: AdviserWindow, qtbot: QtBot):
     click(adviser.start_button)
     qtbot.waitUntil(lambda: adviser.advice is not None)
     assert "No set-up is possible" in adviser.headline.text()
-    assert "dots on the plate" in adviser.headline.text()
+    assert "dots on the imaging plane" in adviser.headline.text()
     assert not adviser.use_button.isEnabled()
 
 

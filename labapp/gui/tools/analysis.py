@@ -57,7 +57,7 @@ class AnalysisWindow(ToolWindow):
         super().__init__(sessions, window)
 
     def _make_form(self) -> None:
-        self.form.add(heading("What is computed"))
+        self.form.add(heading("What to compute"))
         self.parts: dict[str, QCheckBox] = {}
         for key, words, tip in PARTS:
             box = QCheckBox(words)
@@ -68,7 +68,7 @@ class AnalysisWindow(ToolWindow):
             self.form.add(box)
         self.setup = ChoiceField("Set-up", presenter.SETUPS, tooltip="Whose errors are added up")
         self.setup.edited.connect(lambda _: self.show_state())
-        self.form.add(heading("Of the budget"), self.setup)
+        self.form.add(heading("For the budget"), self.setup)
         self.sizes: dict[str, NumberField] = {}
         for key, label, lowest, highest, step, tip in SIZES:
             self.sizes[key] = NumberField(
@@ -93,7 +93,7 @@ class AnalysisWindow(ToolWindow):
             (self.draws, usual.draws),
         ):
             field.set_value(value)
-        others = heading("Of the other parts")
+        others = heading("For the other parts")
         self.form.add(others, self.scheme, self.step, self.frames, self.draws)
 
     def _make_results(self) -> None:

@@ -79,8 +79,8 @@ def matches_text(pattern: str) -> str:
         return f"{count}; conditions: {names}"
     first = "/".join(found[0][0].parts[-2:])
     return (
-        f"{count} without conditions, the first {first}. Write a name in braces for each part of "
-        "the path that is one: {current_a}"
+        f"{count}, the first {first}, without conditions. Where a part of the path is a condition, "
+        "write its name in braces instead, as {current_a}"
     )
 
 

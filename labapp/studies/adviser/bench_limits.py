@@ -22,8 +22,8 @@ Constraint = Literal["torch", "across", "up", "spacing", "once", "dots"]
 
 CONSTRAINTS: dict[Constraint, tuple[str, str]] = {
     "torch": ("rays pass below the electrode's tip", "mm"),
-    "across": ("dots on the plate, left and right", "mm"),
-    "up": ("dots on the plate, above and below", "mm"),
+    "across": ("dots on the imaging plane, left and right", "mm"),
+    "up": ("dots on the imaging plane, above and below", "mm"),
     "spacing": ("neighbouring dots apart", "px"),
     "once": ("no ray meets the pool twice", "rays"),
     "dots": ("dots that a surface needs", "dots"),

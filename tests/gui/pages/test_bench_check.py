@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QRectF, Qt
 from PySide6.QtWidgets import QPushButton
 from pytestqt.qtbot import QtBot
 
@@ -265,6 +265,18 @@ def test_pictures_are_listed_edited_and_removed(
     page.remove_button.click()
     assert [one.mirror for one in page.chosen] == [Plate(0.0)]
     assert not page.mirror_form.diameter.editor.isEnabled()
+
+
+def test_picture_that_is_not_checked_is_shown_whole(
+    qtbot: QtBot, page: BenchCheckPage, tmp_path: Path, plate: GreyImage, checked: CheckResult
+) -> None:
+    add(qtbot, page, tmp_path, plate)
+    rows, columns = plate.shape
+    whole = QRectF(0, 0, columns - 1, rows - 1)
+    page._show_picture(checked.record.pictures[0])
+    assert not page.view.box.viewRect().contains(whole)
+    page._show_picture(None)
+    assert page.view.box.viewRect().contains(whole)
 
 
 def test_pictures_are_stored_with_the_session_until_applied(

@@ -399,6 +399,8 @@ class BenchCheckPage(Page):
         self.pointed.setText("")
         if image is None or found is None:
             self.legend.setText("")
+            if former is not None:
+                self.view.fit()  # no longer the dots of a checked picture
             return
         shown = presenter.overlay(found, image.shape[0])
         arrows = pg.PlotDataItem(
