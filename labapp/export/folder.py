@@ -15,6 +15,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
+
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.errors import InputError
 from labapp.export.formats import (
@@ -46,7 +48,6 @@ from labapp.system import sync_folder
 from labapp.text import SIGMA_OF, now
 from labapp.version import VERSION
 
-TREND = ("width", "length", "height")
 OLD = ".old"
 PICTURES = ("frames", "surfaces", "trends", "film")
 
@@ -360,9 +361,14 @@ def _about(provenance: Mapping[str, object]) -> dict[str, object]:
 
 
 def _draw_trend(path: Path, summary: Summary) -> None:
-    timed = all(time_s is not None for _, time_s, _ in summary.frames)
-    axis = [time_s if timed else frame for frame, time_s, _ in summary.frames]
-    series = {name: summary.series(f"{name}_mm") for name in TREND}
+    times = [time_s for _, time_s, _ in summary.frames if time_s is not None]
+    timed = len(times) == len(summary.frames)
+    axis = times if timed else [frame for frame, _, _ in summary.frames]
+    height, depth = (np.nansum(np.abs(summary.series(name))) for name in ("height_mm", "depth_mm"))
+    names = ("width", "length", "depth" if depth > height else "height")
+    series = {
+        name: (summary.series(f"{name}_mm"), summary.series(f"{name}_sigma_mm")) for name in names
+    }
     write_trend_picture(path, axis, "time (s)" if timed else "frame", series)
 
 

@@ -178,6 +178,24 @@ def test_pictures_are_drawn(run: Run, tmp_path: Path, unmeasured: Measurement) -
     assert contents(tmp_path / "out").keys() == {"manifest.json"}
 
 
+def test_trends_show_the_larger_of_height_and_depth_with_sigma(
+    run: Run, tmp_path: Path, measured: Measurement
+) -> None:
+    drawn: list[dict[str, tuple[np.ndarray, np.ndarray]]] = []
+    choice = ExportChoice(frozenset(), frozenset(), pictures=frozenset({"trends"}))
+    assert measured.measures is not None
+    hollow = replace(measured.measures, height_mm=0.0, depth_mm=-0.6, depth_sigma_mm=0.03)
+    with mock.patch.object(module, "write_trend_picture", lambda *given: drawn.append(given[3])):
+        run(tmp_path / "out", choice)
+        run(tmp_path / "out", choice, [FrameResult(0, 0.0, replace(measured, measures=hollow))])
+    assert [list(series) for series in drawn] == [
+        ["width", "length", "height"],
+        ["width", "length", "depth"],
+    ]
+    (value,), (sigma,) = drawn[1]["depth"]
+    assert (value, sigma) == (-0.6, 0.03)
+
+
 def test_surfaces_are_drawn_in_one_process(run: Run, tmp_path: Path) -> None:
     choice = ExportChoice(frozenset(), frozenset(), pictures=frozenset({"surfaces"}))
     processes = []

@@ -225,7 +225,8 @@ def test_impossible_advice_names_the_broken_constraint() -> None:
     assert not advice.possible
     assert np.isnan(advice.error_mm)
     assert advice.best.margins["up"] < 0
-    assert constraint_text("up", -2.0) == ("dots on the imaging plane, above and below: 2 mm too little")
+    words = "dots on the imaging plane, above and below: 2 mm too little"
+    assert constraint_text("up", -2.0) == words
 
 
 @pytest.mark.parametrize("calibrated", [True, False])

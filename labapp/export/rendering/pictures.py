@@ -23,6 +23,7 @@ from labapp.core.values import FloatArray
 from labapp.export.rendering.scene import scene_of
 from labapp.export.rendering.studio import draw_there, drawing_process
 from labapp.files import write_atomically
+from labapp.text import SIGMA_OF, rounded
 
 ENLARGED = 3
 """Picture pixels per pixel of the frame, for legible labels; pixels are replicated."""
@@ -104,9 +105,19 @@ def write_frame_picture(path: Path, image: npt.NDArray[Any], measurement: Measur
 
 
 def write_trend_picture(
-    path: Path, axis: Sequence[float | None], label: str, series: Mapping[str, FloatArray]
+    path: Path,
+    axis: Sequence[float],
+    label: str,
+    series: Mapping[str, tuple[FloatArray, FloatArray]],
 ) -> None:
     """Write a PNG with one plot per series of lengths over a common axis, with gaps at NaN.
+
+    Parameters
+    ----------
+    axis, label
+        Time or number of each frame, shape (n,), ascending, and the label of the axis.
+    series
+        Values and their σ, NaN where unknown, by the name of the length, shape (n,) each, mm.
 
     Raises
     ------
@@ -119,15 +130,22 @@ def write_trend_picture(
     figure = Figure(figsize=(8, 2.2 * len(series)), layout="constrained")
     FigureCanvasAgg(figure)
     plots = figure.subplots(len(series), sharex=True, squeeze=False)[:, 0]
-    for plot, (name, values) in zip(plots, series.items(), strict=True):
-        plot.plot(axis, values, "o-", markersize=3, linewidth=1)
+    for plot, (name, (values, sigma)) in zip(plots, series.items(), strict=True):
+        bars = np.where(np.isfinite(values), np.nan_to_num(sigma), np.nan)
+        plot.errorbar(axis, values, bars, fmt="o-", markersize=3, linewidth=1, elinewidth=0.7)
         known = values[np.isfinite(values)]
         if len(known) > 1:
-            spread = f"mean {known.mean():.4f}, standard deviation {known.std():.4f} mm"
-            plot.set_title(spread, fontsize="small", loc="right")
+            mean, spread = rounded(known.mean(), known.std())
+            spread = f", standard deviation {spread}" * bool(spread)
+            plot.set_title(f"mean {mean}{spread} mm", fontsize="small", loc="right")
+        if np.isfinite(sigma).any():
+            plot.set_title(f"±: one σ, {SIGMA_OF}", fontsize="small", loc="left")
         plot.set_ylabel(f"{name} (mm)")
         plot.grid(alpha=0.3)
     plots[-1].set_xlabel(label)
+    margin = 0.02 * (axis[-1] - axis[0])
+    if margin > 0:  # shows also frames at the ends that have no surface
+        plots[-1].set_xlim(axis[0] - margin, axis[-1] + margin)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=120)
     write_atomically(path, content.getvalue())

@@ -99,7 +99,7 @@ class ExportPage(Page):
 
     def _show_plan(self, session: Session) -> None:
         self.plan = made = plan(session, self.request, self.workspace.frame)
-        self.files.setText("\n".join(made.files) or "Nothing is selected.")
+        self.files.setText("\n".join(made.files) or "Nothing.")
         self.notes.setText("\n".join(made.notes))
         self._lock_choices(made.locked)
         part, drawn = self.request.which == "part", self.request.has_view
