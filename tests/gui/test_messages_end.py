@@ -6,7 +6,7 @@ import errno
 from pathlib import Path
 
 import pytest
-from PySide6.QtCore import QPoint, QRect
+from PySide6.QtCore import QPoint, QRect, Qt
 from PySide6.QtWidgets import QAbstractButton, QLabel
 from pytestqt.qtbot import QtBot
 
@@ -114,6 +114,21 @@ def test_problems_of_a_session_end_with_it(
     opened.page.relink(moved)
     qtbot.waitUntil(lambda: opened.workspace.session.missing_recording is None)
     qtbot.waitUntil(lambda: opened.status_line.unread == [])
+
+
+def test_missing_selection_is_reported_until_the_next_edit(
+    opened: MainWindow, qtbot: QtBot
+) -> None:
+    opened.show_step("dots")
+    page = opened.page
+    qtbot.waitUntil(lambda: page.editor.correction is not None)
+    page.choose(page.editor.choose_none)
+    hand = Hand(opened)
+    hand.press(Qt.Key.Key_B)
+    assert "Select a row first" in opened.status_line.message.text()
+    page.choose(page.editor.choose_rows, [3])
+    hand.press(Qt.Key.Key_B)
+    assert opened.status_line.unread == []
 
 
 def test_pending_click_ends_with_the_session(

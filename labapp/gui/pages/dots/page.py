@@ -31,7 +31,7 @@ from labapp.gui.shell.steps import recording_gone
 from labapp.gui.views.drag_point import SHIFT, arrow_step
 from labapp.gui.views.picture import PictureView, Tool
 from labapp.gui.widgets.layouts import fill, reveal
-from labapp.gui.workspace import Workspace
+from labapp.gui.workspace import EDITING, Workspace
 
 NO_REFERENCE = "If you know the reference from other frames, press Reference"
 
@@ -294,7 +294,7 @@ class DotsPage(Page):
             return False
         stood = seen.result is not None and not seen.result.stale
         if presenter.needs_fit(seen) and seen.origin == "found" and self.refit.pending:
-            self.workspace.notified.emit(NOT_YET, True)
+            self.workspace.say_wrong(EDITING, NOT_YET)
             self.draw()
             return False
         before, self._before = self._before, (seen.frame, presenter.figures(seen.result))
@@ -374,8 +374,10 @@ class DotsPage(Page):
     def _run(self, command: Command) -> None:
         """Run a command, or report what it needs."""
         if command.text in self._needs and (why := self._unmet_need(command.needs)):
-            is_problem = bool(self.locked) or command.needs != "corrected"
-            self.workspace.notified.emit(why, is_problem)
+            if self.locked or command.needs != "corrected":
+                self.workspace.say_wrong(EDITING, why)
+            else:
+                self.workspace.notified.emit(why, False)
         else:
             command.do()
 
