@@ -285,13 +285,16 @@ class Workspace(QObject):
         show_answer
             Also shows the outcome at the pressed button.
         """
+        from labapp.session.results.measured import scheme_name
+
         session = self.session
         if session is None:
             return
         pool = self._measuring_pool(warm)
 
-        def work(control: Control) -> tuple[int, int, int]:
+        def work(control: Control) -> tuple[int, int, int, str]:
             done, failed, emitted_s = 0, 0, 0.0
+            scheme = scheme_name(session.settings)
             numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
             try:
                 for done, (number, made) in enumerate(
@@ -311,13 +314,15 @@ class Workspace(QObject):
                 raise ValueError(
                     "a process that measures has ended; what was measured is kept: measure again"
                 ) from error
-            return done, failed, _count_stale(session, numbers)
+            return done, failed, _count_stale(session, numbers, scheme), scheme
 
-        def finished(counts: tuple[int, int, int]) -> None:
-            words = measured_text(*counts)
+        def finished(counts: tuple[int, int, int, str]) -> None:
+            done, failed, stale, scheme = counts
+            changed = scheme != scheme_name(session.settings)
+            words = measured_text(done, failed, stale, scheme if changed else "")
             self.notified.emit(words, False)
             if show_answer is not None:
-                show_answer(f"{PROBLEM if any(counts[1:]) else DONE} {words}")
+                show_answer(f"{PROBLEM if failed or stale else DONE} {words}")
 
         def kept(seen: Overview | None) -> None:
             if seen is None:
@@ -345,17 +350,23 @@ class Workspace(QObject):
             self.changed.emit()
 
 
-def measured_text(done: int, failed: int, stale: int) -> str:
-    """Text of how many of the frames done have a surface, have none, and are out of date."""
-    words = f"{pluralize(done - failed, 'frame')} measured"
+def measured_text(done: int, failed: int, stale: int, scheme: str = "") -> str:
+    """Text of how many of the frames done have a surface, have none, and are out of date.
+
+    ``scheme`` is named if it is no longer that of the settings.
+    """
+    from labapp.core.schemes import scheme_words
+
+    by = f" by {scheme_words()[scheme].title}" if scheme else ""
+    words = f"{pluralize(done - failed, 'frame')} measured{by}"
     words += f", {failed} could not be" if failed else ""
     if stale:
         words += f", {stale} already out of date by a change meanwhile: measure again (F5)"
     return words
 
 
-def _count_stale(session: Session, numbers: Sequence[int]) -> int:
-    """Number of these frames whose results are out of date."""
-    seen, wanted = session.overview(), set(numbers)
+def _count_stale(session: Session, numbers: Sequence[int], scheme: str) -> int:
+    """Number of these frames whose results by a scheme are out of date."""
+    seen, wanted = session.overview(scheme), set(numbers)
     pairs = zip(seen.frame.tolist(), seen.stale.tolist(), strict=True)
     return sum(stale and frame in wanted for frame, stale in pairs)

@@ -54,9 +54,16 @@ def test_followed_frames_and_pulses_are_no_failures(
     workspace.close()
 
 
-def test_frames_out_of_date_by_a_change_while_measuring_are_reported(
+@pytest.mark.parametrize(
+    ("change", "words", "mark"),
+    [
+        ({"correspondence": "S/S"}, measured_text(1, 0, 1), PROBLEM),
+        ({"scheme": "ers"}, measured_text(1, 0, 0, "fit"), DONE),
+    ],
+)
+def test_change_of_the_settings_while_measuring_is_reported(
     qapp: QApplication, state: object, copy_sample: CopySample, qtbot: QtBot,
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, change: dict[str, str], words: str, mark: str,
 ) -> None:  # fmt: skip
     workspace, begun, changed = Workspace(), threading.Event(), threading.Event()
     workspace.show(Session.open(copy_sample("thumb_tack")))
@@ -73,13 +80,11 @@ def test_frames_out_of_date_by_a_change_while_measuring_are_reported(
     answers: list[str] = []
     workspace.measure([0], show_answer=answers.append)
     qtbot.waitUntil(begun.is_set)
-    assert workspace.attempt(
-        lambda own: own.set_settings(replace(own.settings, correspondence="S/S"))
-    )
+    assert workspace.attempt(lambda own: own.set_settings(replace(own.settings, **change)))
     with qtbot.waitSignal(workspace.notified) as told:
         changed.set()
-    assert told.args[0] == measured_text(1, 0, 1) != measured_text(1, 0, 0)
-    assert answers[-1].startswith(PROBLEM)
+    assert told.args[0] == words != measured_text(1, 0, 0)
+    assert answers[-1].startswith(mark)
     workspace.close()
 
 
