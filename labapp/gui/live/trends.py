@@ -34,6 +34,9 @@ MARKS = PLAIN, Mark("▪", "beyond its limit")
 LOW_PX = 460
 """On a lower canvas there is no space for both plots and fields."""
 
+LIMITS = 1
+"""Index of the part with the fields."""
+
 LEAST_PX = 48
 """Least height of the plots, which scroll: on a small screen an alarm takes their room."""
 
@@ -135,6 +138,8 @@ class LiveTrends(QWidget):
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Place all fields side by side if they fit; on a low canvas show plots or fields."""
         super().resizeEvent(event)
+        if self._fields.isAncestorOf(self.focusWidget()):
+            self.canvas_parts.setCurrentIndex(LIMITS)  # an alarm must not hide the field in use
         self.canvas_parts.fit(self, LOW_PX)
         way = QBoxLayout.Direction
         is_wide = self.width() >= sum(part.minimumSize().width() for part in self._parts) + ROOM_PX

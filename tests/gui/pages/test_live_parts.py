@@ -41,10 +41,11 @@ from labapp.gui.live.figures import (
     pace_text,
 )
 from labapp.gui.live.surface import steady_limits
-from labapp.gui.live.trends import trend_curves
+from labapp.gui.live.trends import LOW_PX, LiveTrends, trend_curves
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.theme import RED, is_dark
+from labapp.gui.workspace import Workspace
 from labapp.media.cameras import CameraFrame, SimulatedDevice
 from labapp.run import live_watch
 from labapp.run.alarms import Alarm
@@ -53,7 +54,7 @@ from labapp.run.live_measuring import LiveMeasuringEnded, LiveResult
 from labapp.run.live_trend import LiveSizes, Pace
 from labapp.session.session import Session
 from labapp.text import SETUP_MARKS
-from tests.gui.conftest import SAMPLES
+from tests.gui.conftest import SAMPLES, let_draw
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
 from tests.waiting import PATIENCE_S, connect
@@ -265,6 +266,23 @@ def test_only_the_picture_is_shown_without_a_setup(
     words = page.live_view.figures.words.text()
     assert words.startswith(NO_SETUP)
     assert "the laser" in words
+
+
+def test_alarm_that_lowers_the_canvas_does_not_hide_the_limit_being_entered(qtbot: QtBot):
+    trends = LiveTrends(Workspace())
+    qtbot.addWidget(trends)
+    trends.resize(900, 600)
+    trends.show()
+    field = trends.fields["height", 1].editor
+    field.setFocus()
+    trends.resize(900, LOW_PX - 20)
+    let_draw()
+    assert field.isVisible()
+    assert not trends.plots.isVisible()
+    trends.resize(900, 600)
+    let_draw()
+    assert field.isVisible()
+    assert trends.plots.isVisible()
 
 
 @pytest.mark.parametrize("old_s", [-1.0, 60.0])
