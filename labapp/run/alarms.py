@@ -23,6 +23,9 @@ NOT_MEASURED, SILENT, DOUBTFUL = "not-measured", "silent", "setup-doubtful"
 """Codes of the alarms that frames cannot be measured, that none is measured, and that the set-up is
 doubtful; the others are ``width-low`` … ``height-high``."""
 
+RAISED = "ALARM: "
+"""Begins the text of an event that raises an alarm."""
+
 
 @dataclass(frozen=True)
 class Alarm:

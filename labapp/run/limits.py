@@ -73,7 +73,7 @@ class Limits:
                 expected = f"-{LARGEST_MM:g} to {LARGEST_MM:g} (mm)"
                 problems.append(InputError("limits", f"{name}_mm", given, expected))
             elif low is not None and high is not None and low >= high:
-                expected = f"the lowest below the highest, {high:g} mm"
+                expected = f"a minimum below the maximum, {high:g} mm"
                 problems.append(InputError("limits", f"{name}_mm", f"{low:g} mm", expected))
         if self.unmeasured < 1:
             problems.append(InputError("limits", "unmeasured", self.unmeasured, "1 or more frames"))

@@ -21,7 +21,7 @@ from labapp.export.rendering.scene import Scene
 from labapp.log import NAME
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
-from labapp.run.alarms import Alarm, Alarms
+from labapp.run.alarms import RAISED, Alarm, Alarms
 from labapp.run.limits import Limits
 from labapp.run.live_measuring import LiveMeasuring, LiveMeasuringEnded, LiveResult
 from labapp.run.live_queue import FrameQueue
@@ -234,7 +234,7 @@ class LiveWatch:
             events.append((Event(self._name, "note", f"limits: {limits.words}"), None))
         for alarm in self.alarms.shown:
             if alarm.holds:
-                words = f"ALARM: {alarm.description}"
+                words = f"{RAISED}{alarm.description}"
                 events.append((Event(self._name, "warning", words), alarm.time_s))
         return events
 
@@ -292,5 +292,5 @@ class LiveWatch:
     def _changed(self, alarm: Alarm) -> Event:
         """Return the event for an alarm that is raised or over."""
         if alarm.holds:
-            return Event(self._name, "warning", f"ALARM: {alarm.words} (frame {alarm.frame})")
+            return Event(self._name, "warning", f"{RAISED}{alarm.words} (frame {alarm.frame})")
         return Event(self._name, "note", f"alarm over: {alarm.description}")

@@ -220,7 +220,6 @@ def _live_parts(hands: Hands, page: CapturePage) -> None:
     hands.press("Acknowledge")
     hands.enter("Width, max.", "9")
     hands.wait(lambda: not canvas.alarms.isVisible(), "the alarm to go")
-    hands.dismiss()
     canvas.tabs.setCurrentIndex(streams)
     hands.picture("live-control")
     canvas.tabs.setCurrentIndex(0)

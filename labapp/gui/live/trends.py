@@ -187,6 +187,6 @@ class LiveTrends(QWidget):
         except InputError as error:
             if field is not None:
                 self.fields[field].set_value(session.limits.of(field[0])[field[1]])
-                self.fields[field].refuse(f"It must be {error.expected}")
+                self.fields[field].refuse(f"Expected {error.expected}")
             return
         self._workspace.attempt(lambda session: session.set_limits(limits))

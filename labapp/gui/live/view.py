@@ -44,6 +44,7 @@ from labapp.media.cameras import (
 from labapp.media.events import Event
 from labapp.media.recording.recorder import recording_path
 from labapp.media.recording.take_files import Take
+from labapp.run.alarms import RAISED
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_watch import LiveWatch
 from labapp.session.frame_size import calibrated_px
@@ -98,6 +99,8 @@ class LiveView(QObject):
         """Number of times that a live frame was shown, as a picture or as a surface."""
         self._ending: list[Live] = []
         self._pools: dict[str, SimulatedDevice] = {}
+        self._raised: list[str] = []
+        """Reports of alarms that are not acknowledged."""
         self._opening: Task | None = None
         self._finding: Task | None = None
         self._status_s = self.measured_s = 0.0
@@ -318,6 +321,8 @@ class LiveView(QObject):
         """Acknowledge the alarms for the operator."""
         watch = self._watch()
         self.canvas.alarms.clear()
+        while self._raised:
+            self.workspace.settled.emit(self._raised.pop())
         if watch is not None:
             watch.acknowledge()
             self.canvas.show_status(watch)
@@ -400,6 +405,8 @@ class LiveView(QObject):
             self.workspace.say_wrong(CONNECTION, str(event))
             return
         recorded = live.running is not None or event.source != live.name
+        if event.words.startswith(RAISED):
+            self._raised.append(str(event))
         problem = event.kind == "warning" or (event.kind == "loss" and recorded)
         if problem and event.kind == "loss":
             self.workspace.urgent.emit(str(event))

@@ -334,6 +334,7 @@ def test_alarm_is_shown_logged_recorded_and_acknowledged(
     page.setFocus()
     hand.press(Qt.Key.Key_A)
     assert not view.canvas.alarms.isVisible()
+    assert window.status_line.unread == []
     Prepared.found = DARK
     qtbot.waitUntil(view.canvas.alarms.isVisible)
     assert "3 frames in a row could not be measured: it is dark" in view.canvas.alarms.words.text()
@@ -386,11 +387,11 @@ def test_invalid_limits_are_rejected_and_valid_ones_undone(
     hand.enter(fields["length", 1], "6.5")
     session = window.workspace.session
     assert session.limits == Limits(length_mm=(7.0, None))
-    assert "the lowest below the highest" in fields["length", 1].problem.text()
+    assert "a minimum below the maximum" in fields["length", 1].problem.text()
     assert fields["length", 1].value() is None
     hand.enter(view.canvas.trends.unmeasured, "12")
     assert session.limits.unmeasured == 12
-    assert "the lowest below the highest" in fields["length", 1].problem.text()
+    assert "a minimum below the maximum" in fields["length", 1].problem.text()
     assert view.live.watch.alarms.limits == session.limits
     window.workspace.undo()
     window.workspace.undo()
