@@ -210,7 +210,8 @@ def test_number_of_drawn_points_is_limited(view: PlotStack) -> None:
 def test_frame_without_a_point_is_marked_at_its_time(view: PlotStack) -> None:
     axis = replace(TIME, span=(-1.0, 9.0))
     view.show_curves([curve()], axis)
-    view.set_current(1, 8.5)
+    view.set_current(1, 8.5, "Frame 1: no surface")
+    assert view.read_out.text() == "Frame 1: no surface"
     (plot,) = view._plots
     assert plot.current.isVisible()
     assert plot.current.value() == 8.5

@@ -63,6 +63,7 @@ class PlotStack(Plotted):
         self._plots: list[_Plot] = []
         self._current: int | None = None
         self._place: float | None = None
+        self._without = ""
         self.setToolTip(f"Click a point to go to its frame; wheel or drag along the axis. {KEYS}")
         self.canvas = pg.GraphicsLayoutWidget()
         self.canvas.setFocusPolicy(Qt.FocusPolicy.NoFocus)
@@ -107,21 +108,20 @@ class PlotStack(Plotted):
         self._show_legend()
         if not (same and self._current is None and self._place is None):
             self.set_current(
-                self._current, self._place
+                self._current, self._place, self._without
             )  # otherwise the value under the pointer stays visible
 
-    def set_current(self, key: int | None, place: float | None = None) -> None:
-        """Mark the point with a key in every plot, or a position if no curve has the key."""
-        self._current, self._place = key, place
+    def set_current(self, key: int | None, place: float | None = None, without: str = "") -> None:
+        """Mark the point with a key in every plot; if no curve has it, a position, with a text."""
+        self._current, self._place, self._without = key, place, without
         found = [(curve, _index_of(curve, key)) for curve in self.curves]
         points = [(curve, index) for curve, index in found if index is not None]
         if points:
             place = float(points[0][0].x[points[0][1]])
         for plot in self._plots:
             _put(plot.current, place)
-        self._show_read_out(
-            _joined([point_text(curve, index, self.axis) for curve, index in points])
-        )
+        words = [point_text(curve, index, self.axis) for curve, index in points]
+        self._show_read_out(_joined(words) if words else without)
 
     def fit(self) -> None:
         """Show the whole axis."""

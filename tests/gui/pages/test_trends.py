@@ -67,6 +67,9 @@ def test_marks_show_the_status_of_frames(copy_sample) -> None:
         assert dict(zip(curve.key.tolist(), curve.mark.tolist(), strict=True))[2] == CORRECTED
         words = show(session, TrendOptions()).words
         assert words == "Fit: 3 of 6 frames count, 3 without a surface"
+        without = show(session, TrendOptions()).without
+        assert list(without) == [3, 4, 5]
+        assert without[3] == "Frame 3: no surface (ambiguous-rows)"
         fit = replace(session.settings.fit, jerk=0.06)
         session.set_settings(replace(session.settings, fit=fit))
         shown = show(session, TrendOptions())

@@ -102,7 +102,9 @@ class TrendsPage(Page):
             widget.setEnabled(not session.has_lines)
 
     def _mark(self, frame: int) -> None:
-        self.plots.set_current(frame, None if self.shown is None else self.shown.places.get(frame))
+        shown = self.shown
+        if shown is not None:
+            self.plots.set_current(frame, shown.places.get(frame), shown.without.get(frame, ""))
 
     def _show_events(self, events: Mapping[str, tuple[Event, ...]]) -> None:
         self._events = events

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -92,6 +92,8 @@ class TrendsState:
     """Text of the strongest oscillation, or the reason why there is no spectrum."""
     signals_words: str
     """Text about current and voltage."""
+    without: Mapping[int, str] = field(default_factory=dict)
+    """Text of each frame without a surface, by its number."""
 
 
 def first_shown(seen: Overview) -> tuple[str, ...]:
@@ -145,6 +147,11 @@ def show(
         spectrum_axis=spectrum_axis,
         spectrum_words=message,
         signals_words=_told_signals(signals, seen, timed),
+        without={
+            frame: f"Frame {frame}: {f'no surface ({status})' if status else 'not measured yet'}"
+            for frame, status in zip(seen.frame.tolist(), seen.status, strict=True)
+            if status != "ok"
+        },
     )
 
 
