@@ -67,7 +67,7 @@ def rows(shown: ScenarioPreview, frames: int) -> tuple[ResultRow, ...]:
         ResultRow("Highest point", size.height_mm, unit="mm"),
         ResultRow("Lowest point", size.depth_mm, unit="mm"),
         *(ResultRow(name, float(of.sum()), unit=unit, decimals=0) for name, of, unit in counts),
-        ResultRow("Frame rate", rate, unit="Hz", decimals=1),
+        ResultRow("Frame rate", rate, unit="frames/s", decimals=1),
         ResultRow("Recording lasts", frames / rate if rate else None, unit="s", decimals=2),
         ResultRow("Frame", f"{wide} × {high}", unit="px"),
         ResultRow("Recording", recording.file),

@@ -731,6 +731,7 @@ def test_other_recordings_are_listed_on_reopening(
     assert page.kept.isVisible()
     assert page.kept.choice.editor.count() == 1
     assert page.kept.choice.value() == str(live.takes[0].path)
+    assert page.kept.choice.editor.currentText()[:4].isdecimal()  # begins with the year
     hand.button("Preview")
     qtbot.waitUntil(lambda: page.preview is not None)
     hand.button("Import")

@@ -39,13 +39,13 @@ class KeptRecordings(Group):
         except OSError:
             found = []  # problems of the folder are reported when it is written to
         kept = [path for path in reversed(found) if path not in others]
-        self.choice.set_choices([(str(path), _choice_text(path)) for path in kept])
+        self.choice.set_choices([(str(path), _choice_text(path, session)) for path in kept])
         if kept:
             self.choice.set_value(str(kept[0]))
         self.setVisible(bool(kept))
 
 
-def _choice_text(path: Path) -> str:
-    """Name of a recording beside the session, and whether another session uses it."""
-    used = path.with_suffix(SUFFIX).exists()
-    return f"{path.name}, has its own session" if used else path.name
+def _choice_text(path: Path, session: Session) -> str:
+    """What tells a recording from the others beside the session, and whether it is in another."""
+    name = path.name.removeprefix(f"{session.path.stem}-")  # all of them begin like that
+    return f"{name}, has its own session" if path.with_suffix(SUFFIX).exists() else name
