@@ -150,6 +150,20 @@ def test_error_far_from_the_marks_is_within_its_bound(view: tuple[float, float, 
     assert np.mean(within) >= 0.9
 
 
+@pytest.mark.parametrize("view", [(1e6, 0, 0), (800, 4, -6), (450, -8, 4), (600, 3, 10)])
+def test_covariance_covers_the_perspective_that_marks_leave_open(
+    view: tuple[float, float, float],
+) -> None:
+    matrix, rng = pinhole(*view), np.random.default_rng(44)
+    ratios = []
+    for _ in range(30):
+        fits = noisy(matrix, rng)
+        used = fits.of(fits.best).calibration
+        off = (used.to_image(PLATE_MM) - projected(matrix, PLATE_MM)).ravel()
+        ratios.append(np.mean(off**2) / np.trace(fits.covariance_px2(used, PLATE_MM)) * off.size)
+    assert np.mean(ratios) < 1.2
+
+
 def test_marks_without_noise_reproduce_the_map() -> None:
     matrix = pinhole(500, 12, -17)
     fits = fit_marks(MARKS_MM, projected(matrix, MARKS_MM))

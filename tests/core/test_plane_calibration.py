@@ -37,6 +37,8 @@ class Scene:
     has_dot: bool = True
     has_x: bool = True
     has_z: bool = True
+    bench: float | None = None
+    """Grey level around the plane, 1.1 units from O′, as on the printed target; None: no bench."""
     seed: int = 0
 
     @property
@@ -73,11 +75,14 @@ class Scene:
             outside += [box(0, bar + flag_out, n - 0.03, n + 0.03) for n in range(2, 4)]
         distance_px = np.minimum.reduce(outside) * self.unit_px
         ink = np.clip(0.5 - distance_px / 2.0, 0.0, 1.0)
+        light = np.full(self.shape, self.light)
+        if self.bench is not None:
+            light[np.minimum(x, z) < -1.1] = self.bench
         across, down = (np.linspace(-1, 1, n) for n in self.shape[::-1])
         fall = 1 - self.vignetting * (across**2 + down[:, None] ** 2) / 2
         fall = fall + self.slope * across / 2
         rng = np.random.default_rng(self.seed)
-        grey = (self.light + (self.dark - self.light) * ink) * fall
+        grey = (light + (self.dark - light) * ink) * fall
         grey += rng.normal(0, self.noise, grey.shape)
         grey.flat[rng.integers(0, grey.size, 60)] = rng.choice([0.0, 255.0], 60)
         return np.clip(np.round(grey), 0, 255).astype(np.uint8)
@@ -162,6 +167,19 @@ def test_hidden_flag_is_not_a_mark() -> None:
     assert len(calibration.marks) == 14
     assert 6 * 6.35 not in [mark[0] for mark in calibration.marks]
     assert np.abs(points(calibration) - scene.truth).max() < 0.3
+
+
+@pytest.mark.parametrize("unit_px", [12.0, 16.0, 20.0])
+@pytest.mark.slow
+def test_target_beside_a_dark_bench_is_found(unit_px: float) -> None:
+    scene = Scene(3.0, unit_px, (160.0, 400.0), light=90.0, dark=20.0, slope=0.1, bench=2.0)
+    assert np.abs(points(calibrate_plane(scene.render())) - scene.truth).max() < 0.3
+
+
+@pytest.mark.slow
+def test_small_picture_is_calibrated() -> None:
+    scene = Scene(2.0, 10.0, (30.3, 180.7), (220, 200), light=90.0, noise=2.0)
+    assert np.abs(points(calibrate_plane(scene.render())) - scene.truth).max() < 0.5
 
 
 @pytest.mark.slow
@@ -250,6 +268,17 @@ def test_partly_covered_bar_is_never_measured_wrong() -> None:
         except CannotMeasure:
             continue
         assert np.hypot(*(points(calibration) - scene.truth).T).max() < 3.0
+
+
+@pytest.mark.parametrize("end", [4.12, 4.15])
+@pytest.mark.slow
+def test_tape_that_looks_like_the_end_of_a_bar_is_rejected(end: float) -> None:
+    scene = Scene(roll_deg=0.0, light=90.0, dark=20.0, noise=0.5, vignetting=0.0, slope=0.0)
+    image, (u, v) = scene.render(), scene.origin
+    top, bottom = (round(v - units * scene.unit_px) for units in (end, 3.35))
+    image[top:bottom, round(u) - 25 : round(u) + 25] = 45
+    with pytest.raises(CannotMeasure, match="no-target"):
+        calibrate_plane(image)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -36,6 +36,7 @@ PERSPECTIVE = ((6,), (7,), (6, 7))
 """Free matrix entries, row by row: of an affine map; of perspective along X′, Z′ and both."""
 
 HELP = "set the camera square, or use more marks"
+UNKNOWN_PERSPECTIVE = f"how obliquely the camera looks is not known: {HELP}"
 
 FIELD = 1.5
 """Dots land within the square from O′ whose side is this many times the longer axis."""
@@ -133,6 +134,29 @@ class MarkFits:
         """Grid of points (X′, Z′) over the region of the dots, shape (n, 2), mm."""
         return _field(self.corner_mm)
 
+    def covariance_px2(self, used: ImageCalibration, plane_mm: FloatArray) -> FloatArray:
+        """Covariance of a map's errors at (X′, Z′), shape (n, 2), as u, v, u, v, …, px².
+
+        The true map is that of `bound_mm`. A map with less perspective scatters less, but marks
+        that do not show a perspective do not show that there is none.
+
+        Raises
+        ------
+        ValueError
+            If there are too few marks.
+        """
+        if self.whole is None:
+            raise ValueError(self.reason)
+        off = used.to_image(plane_mm) - self.whole.calibration.to_image(plane_mm)
+        own = self.whole.covariance_px2(plane_mm)
+        return np.asarray(self._student**2 * own + np.outer(off, off))
+
+    @property
+    def _student(self) -> float:
+        """Student's factor: the scatter along an axis is estimated from few residuals."""
+        assert self.whole is not None
+        return float(scipy.special.stdtrit(self.whole.spare[:, 0].sum(), 0.975) / 1.96)
+
     def bound_mm(self, used: ImageCalibration) -> float:
         """95 % bound of a map's error at the far corner, mm; NaN if unknown.
 
@@ -145,9 +169,7 @@ class MarkFits:
         seen = self.whole.calibration.to_image(corner)
         slope = used.jacobian(seen)[0]
         off = (used.to_plane(seen) - corner)[0]
-        # The scatter along an axis is estimated from few residuals: Student's factor.
-        wider = scipy.special.stdtrit(self.whole.spare[:, 0].sum(), 0.975) / 1.96
-        covariance = wider**2 * slope @ self.whole.covariance_px2(corner) @ slope.T
+        covariance = self._student**2 * slope @ self.whole.covariance_px2(corner) @ slope.T
         # |off + noise|² is approximated by c·χ²(n) of equal mean and variance (Satterthwaite 1946).
         mean = off @ off + np.trace(covariance)
         spread = 2 * np.sum(covariance**2) + 4 * off @ covariance @ off
@@ -159,7 +181,7 @@ class MarkFits:
         """Return text on the map's possible error in the region of the dots, and on remedies."""
         bound, whole = self.bound_mm(used), self.whole
         if whole is None:
-            return (f"how obliquely the camera looks is not known: {HELP}",)
+            return (UNKNOWN_PERSPECTIVE,)
         corner = f"{self.corner_mm:.0f}, {self.corner_mm:.0f} mm"
         bound_text = f"± {bound:.2g} mm at the plate's far corner (X′, Z′ = {corner}; 95 %)"
         if bound <= WHAT_MATTERS_MM:

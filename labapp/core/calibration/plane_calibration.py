@@ -15,7 +15,13 @@ from functools import cached_property
 
 import numpy as np
 
-from labapp.core.calibration.mark_fit import MarkFits, Model, fit_marks, root_mean_square
+from labapp.core.calibration.mark_fit import (
+    UNKNOWN_PERSPECTIVE,
+    MarkFits,
+    Model,
+    fit_marks,
+    root_mean_square,
+)
 from labapp.core.calibration.seen_axes import POINTS, SeenAxes
 from labapp.core.calibration.target_bars import (
     Bar,
@@ -116,17 +122,28 @@ class PlaneCalibration(SeenAxes):
     @property
     def points_covariance_px2(self) -> FloatArray:
         """Covariance of these points, shape (6, 6), px²."""
-        if self.fits is None or self.model == "three points":
-            return np.diag(np.repeat(np.square(self.sigma_px), 2))
-        return self.fits.of(self.model).covariance_px2(self._points_mm)
+        return self._covariance_px2(self._points_mm)
 
     @property
     def affine_covariance_px2(self) -> FloatArray:
         """Covariance of these points under an affine change of the picture, shape (6, 6), px²."""
-        if self.fits is None or self.model != "homography":
+        if self.fits is None or self.fits.whole is None:
             return self.points_covariance_px2
         field = self.fits.field_mm
-        return self._affine_covariance_px2(field, self.fits.of(self.model).covariance_px2(field))
+        return self._affine_covariance_px2(field, self._covariance_px2(field))
+
+    def _covariance_px2(self, plane_mm: FloatArray) -> FloatArray:
+        """Covariance of the image positions of (X′, Z′), with too few marks of the three points."""
+        if self.fits is not None and self.fits.whole is not None:
+            return self.fits.covariance_px2(self._straight, plane_mm)
+        if self.fits is None or self.model == "three points":
+            return np.diag(np.repeat(np.square(self.sigma_px), 2))
+        return self.fits.of(self.model).covariance_px2(plane_mm)
+
+    @property
+    def _straight(self) -> ImageCalibration:
+        """The map from positions without distortion."""
+        return ImageCalibration(self.image_calibration.matrix)
 
     @property
     def image_calibration(self) -> ImageCalibration:
@@ -167,8 +184,9 @@ class PlaneCalibration(SeenAxes):
 
     def fit_lines(self) -> list[str]:
         """Return text lines on the residuals of the fits and the choice of the model."""
+        error = [f"{'error':<10} {words}" for words in self.bound_words()]
         if self.fits is None:
-            return ["used       the three points: too few marks where the target has them"]
+            return ["used       the three points: too few marks where the target has them", *error]
         named = (("affine", self.fits.affine), ("homography", self.fits.homography))
         lines = [
             f"{name:<10} residual {root_mean_square(fit.residual_px):.3f} px, "
@@ -180,12 +198,13 @@ class PlaneCalibration(SeenAxes):
         ]
         why = self.fits.reason if self.model == self.fits.best else "chosen by hand"
         lines.append(f"used       {self.model}, {len(self.marks)} marks. {why}")
-        return [*lines, *(f"{'error':<10} {words}" for words in self.bound_words())]
+        return [*lines, *error]
 
     def bound_words(self) -> tuple[str, ...]:
-        """Return text on the model's possible error at the dots; empty without marks."""
-        straight = ImageCalibration(self.image_calibration.matrix)
-        return () if self.fits is None else self.fits.bound_words(straight)
+        """Return text on the model's possible error at the dots."""
+        if self.fits is None:
+            return (UNKNOWN_PERSPECTIVE,)
+        return self.fits.bound_words(self._straight)
 
     def with_scale(self, factor: float) -> PlaneCalibration:
         """Return the calibration for the same picture of a target scaled by a factor."""
@@ -219,16 +238,16 @@ def calibrate_plane(
         ``no-target`` if O′ and the two bars are not found as designed; the reason states what is
         missing or does not fit.
     """
-    background, darkness = levelled(grey_levels(image))
     failure = Refusal(-1, "The picture shows no dark marks on a light plane.")
-    for threshold, binary in segmented(darkness):
-        try:
-            marks = three_marks(binary)
-            return _measured(marks, darkness, background, threshold, unit_mm, lens)
-        except Refusal as refusal:
-            # The attempt that failed at the latest stage was closest: report its reason.
-            if refusal.stage > failure.stage:
-                failure = refusal
+    for background, darkness in levelled(grey_levels(image)):
+        for threshold, binary in segmented(darkness):
+            try:
+                marks = three_marks(binary)
+                return _measured(marks, darkness, background, threshold, unit_mm, lens)
+            except Refusal as refusal:
+                # The attempt that failed at the latest stage was closest: report its reason.
+                if refusal.stage > failure.stage:
+                    failure = refusal
     raise CannotMeasure("no-target", failure.reason)
 
 
@@ -270,6 +289,13 @@ def _measured(
         # Without flags, only the ends can show whether the bars are completely visible.
         for axis, bar, units in zip(AXES, bars, (X_UNITS, Z_UNITS), strict=True):
             _check_length(axis, origin, bar, units)
+    if ticks is None:
+        # In perspective, a bar with a hidden end can have the length of a whole one.
+        raise Refusal(
+            5,
+            "The flags of the bars do not fit their ends: part of a bar is hidden, the lens "
+            "distorts, or it is not this target.",
+        )
     if ticks:
         found = replace(found, marks=ticks)
         assert found.fits is not None
@@ -291,8 +317,8 @@ def _tick_marks(
     bars: tuple[Bar, Bar],
     darkness: FloatArray,
     unit_mm: float,
-) -> tuple[tuple[float, float, float, float, float], ...]:
-    """O′, the ends of the bars and their flags; empty if too few agree with the design."""
+) -> tuple[tuple[float, float, float, float, float], ...] | None:
+    """O′, the bars' ends and flags; empty if too few are seen, None if they disagree."""
     unit_px = float(np.hypot(*(bars[0].middle - origin))) / (sum(X_UNITS) / 2.0)
     places = [(0.0, 0.0, origin)]
     least = 1
@@ -304,6 +330,8 @@ def _tick_marks(
     marks = [
         (x, z, *_pair(place), local_noise(darkness, place, 0.5 * unit_px)) for x, z, place in places
     ]
+    if len(marks) < least:
+        return ()
     ends = {(t, 0.0) for t in X_UNITS} | {(0.0, t) for t in Z_UNITS}
     while len(marks) >= least:
         table = np.array(marks)
@@ -313,14 +341,14 @@ def _tick_marks(
         off = np.hypot(*fit.left_out_px.T)
         worst = int(np.argmax(off))
         stray = off[worst] > max(5.0 * float(np.median(off)), 0.3)
-        # A scratch or a speck can be mistaken for a flag; O′ and the ends have been checked.
+        # A scratch or a speck can be mistaken for a flag, but for neither O′ nor an end.
         if stray and worst and marks[worst][:2] not in ends:
             del marks[worst]
             continue
         if off[worst] > MARK_OFF * unit_px:
-            return ()
+            break
         return tuple((x * unit_mm, z * unit_mm, u, v, noise) for x, z, u, v, noise in marks)
-    return ()
+    return None
 
 
 def _check_pointing(axis: str, origin: FloatArray, bar: Bar, units: tuple[float, float]) -> None:

@@ -82,7 +82,7 @@ def measured_bar(mark: Mark, darkness: FloatArray, axis: str) -> Bar:
     Cross-sections through unit flags are outliers of the midline and are rejected.
     """
     step = 0.5
-    margin = 1.5 * mark.width
+    margin = max(1.5 * mark.width, 2.0 * END_PX)
     along = np.arange(-mark.length / 2.0 - margin, mark.length / 2.0 + margin, step)
     across = np.arange(-mark.width, mark.width + step / 2.0, step)
     normal = np.array([-mark.direction[1], mark.direction[0]])
@@ -159,10 +159,10 @@ def _end(
     place = along[i] + (profile[i] - half) / fall * (along[i + 1] - along[i])
     slope = fall / (along[i + 1] - along[i])
     off = along - place
-    inside, outside = (
-        float(np.median(profile[(side * off > END_PX) & (side * off < 3.0 * END_PX)]))
-        for side in (-1, 1)
-    )
+    sides = [profile[(side * off > END_PX) & (side * off < 3.0 * END_PX)] for side in (-1, 1)]
+    if not all(levels.size for levels in sides):
+        raise Refusal(4, f"The bar on {axis} has no clear end.")
+    inside, outside = (float(np.median(levels)) for levels in sides)
     share = (profile - outside) / max(inside - outside, 1e-6)
     covered = np.clip((share - 0.2) / 0.6, 0.0, 1.0)
     place += END_PX * (float(np.trapezoid(covered, np.clip(off / END_PX, -1.0, 1.0))) - 1.0)

@@ -6,6 +6,7 @@ thinning. `plane_calibration` measures the marks and checks them against the des
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, ReadOnlyArrays, robust_sigma
 
 ColourOrGrey = npt.NDArray[Any]
+EightBit = npt.NDArray[np.uint8]
 
 MEDIAN_PX, DILATIONS = 7, 12
 """Side of the median filter, and largest number of dilations by 3 × 3, in a picture of 640 px; both
@@ -23,6 +25,9 @@ are scaled with the picture."""
 
 SPECK_FRACTION = 0.02
 """An object smaller than this fraction of the largest is a speck."""
+
+MOST_AROUND = 0.7
+"""What surrounds the plane in the picture is darker than this share of the plane's light."""
 
 MOST_ROLL_DEG = 30.0
 """Largest rotation of the bars from the horizontal and the vertical, degrees."""
@@ -87,10 +92,12 @@ def grey_levels(image: ColourOrGrey) -> FloatArray:
     return np.asarray(cv2.medianBlur(grey.astype(np.float32), 3), np.float64)
 
 
-def levelled(grey: FloatArray) -> tuple[FloatArray, FloatArray]:
+def levelled(grey: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Background light of the plane, and the fraction missing at each pixel; both shaped as given.
 
-    The background is the median over a window of which any mark fills less than half.
+    The background is the median over a window of which any mark fills less than half. Where the
+    plane does not fill the picture, what is dark around it darkens the background of the marks near
+    its edge: a second pair is then without it.
     """
     height, width = grey.shape
     factor = max(2, max(height, width) // 160)
@@ -99,19 +106,46 @@ def levelled(grey: FloatArray) -> tuple[FloatArray, FloatArray]:
     )
     low, high = float(small.min()), float(small.max())
     if high - low < 1e-9:
-        return grey, np.zeros_like(grey)
-    window = _odd(max(small.shape) / 7.0)
+        yield grey, np.zeros_like(grey)
+        return
     eight_bit = np.round((small - low) / (high - low) * 255.0).astype(np.uint8)
-    median = cv2.medianBlur(eight_bit, window).astype(np.float64)
-    median = np.asarray(cv2.GaussianBlur(median, (0, 0), window / 6.0), np.float64)
-    background = low + (high - low) / 255.0 * cv2.resize(
-        median, (width, height), interpolation=cv2.INTER_LINEAR
-    )
-    background = np.maximum(background, 1e-3 * high)
-    return background, 1.0 - grey / background
+    around = _around_plane(eight_bit, small)
+    for outside in (None, around) if around.any() else (None,):
+        plane = eight_bit if outside is None else _filled(eight_bit, outside)
+        background = low + (high - low) / 255.0 * cv2.resize(
+            _background(plane), (width, height), interpolation=cv2.INTER_LINEAR
+        )
+        background = np.maximum(background, 1e-3 * high)
+        darkness = 1.0 - grey / background
+        if outside is not None:
+            enlarged = cv2.resize(outside, (width, height), interpolation=cv2.INTER_NEAREST)
+            darkness[enlarged > 0] = 0.0
+        yield background, darkness
 
 
-def segmented(darkness: FloatArray) -> list[tuple[float, npt.NDArray[np.uint8]]]:
+def _background(levels: EightBit) -> FloatArray:
+    window = _odd(max(levels.shape) / 7.0)
+    median = cv2.medianBlur(levels, window).astype(np.float64)
+    return np.asarray(cv2.GaussianBlur(median, (0, 0), window / 6.0), np.float64)
+
+
+def _filled(levels: EightBit, outside: EightBit) -> EightBit:
+    """Replace the masked part by levels like those beside it."""
+    return np.asarray(cv2.inpaint(levels, outside, 3.0, cv2.INPAINT_TELEA), np.uint8)
+
+
+def _around_plane(levels: EightBit, grey: FloatArray) -> EightBit:
+    """Return a mask of what is dark and runs out of the picture, with the blur of its edge."""
+    _, dark = cv2.threshold(levels, 0, 1, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)
+    if np.mean(grey[dark > 0]) > MOST_AROUND * np.mean(grey[dark == 0]):
+        return np.zeros_like(levels)
+    _, labels = cv2.connectedComponents(np.asarray(dark, np.uint8), connectivity=4)
+    at_edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    around = np.isin(labels, at_edge[at_edge > 0]).astype(np.uint8)
+    return np.asarray(cv2.dilate(around, np.ones((5, 5), np.uint8)), np.uint8)
+
+
+def segmented(darkness: FloatArray) -> list[tuple[float, EightBit]]:
     """Return binary pictures to try, the dissertation's filter first (Eq. 5-1, 5-3).
 
     Parameters
@@ -136,7 +170,7 @@ def segmented(darkness: FloatArray) -> list[tuple[float, npt.NDArray[np.uint8]]]
     ]
 
 
-def _binary_median(binary: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.uint8]:
+def _binary_median(binary: EightBit, side: int) -> npt.NDArray[np.uint8]:
     """Return what `cv2.medianBlur` does for a picture of 0 and 1, many times as fast: a count."""
     count = cv2.boxFilter(
         binary, cv2.CV_16U, (side, side), normalize=False, borderType=cv2.BORDER_REPLICATE
@@ -159,7 +193,7 @@ def _levels(darkness: FloatArray) -> list[float]:
     return [float(level) for level in named + steps if level > 2.0 * noise]
 
 
-def three_marks(binary: npt.NDArray[np.uint8]) -> tuple[Mark, Mark, Mark]:
+def three_marks(binary: EightBit) -> tuple[Mark, Mark, Mark]:
     """Return the dot, the bar on O′X′ and the bar on O′Z′ in a binary picture.
 
     Raises
@@ -197,7 +231,7 @@ def three_marks(binary: npt.NDArray[np.uint8]) -> tuple[Mark, Mark, Mark]:
     return _thin(dot), _thin(x_bar), _thin(z_bar)
 
 
-def _three_objects(binary: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.int32], bool]:
+def _three_objects(binary: EightBit) -> tuple[npt.NDArray[np.int32], bool]:
     """Labels 1, 2, 3 of the objects, and whether another is cut by the picture's edge."""
     kept, touching = _without_specks(binary)
     square = np.ones((3, 3), np.uint8)
@@ -216,7 +250,7 @@ def _three_objects(binary: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.int32]
     return np.asarray(labels, np.int32), touching
 
 
-def _without_specks(binary: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], bool]:
+def _without_specks(binary: EightBit) -> tuple[npt.NDArray[np.uint8], bool]:
     """Remove specks and objects at the edge; also return whether a large one touches the edge."""
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
     left, top, width, height, area = boxes[1:].T

@@ -103,7 +103,7 @@ def test_setup_is_calibrated_until_it_is_edited(empty: Session) -> None:
     assert known.sigma[INDEX["laser.distance_mm"]] == laser.distance_sigma_mm
     assert known.correlation[ANGLE, DISTANCE] == pytest.approx(laser.correlation)
     covariance = known.covariance[np.ix_(POINTS, POINTS)]
-    np.testing.assert_allclose(covariance, plane.points_covariance_px2, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(covariance, plane.affine_covariance_px2, rtol=1e-6, atol=1e-9)
     # A changed value is no longer calibrated.
     presenter.put(empty, "laser.distance_mm", 31.0)
     changed = empty.setup.rig.uncertainty
