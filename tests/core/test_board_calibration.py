@@ -197,6 +197,15 @@ def glaring_chessboard():
     return cv2.circle(image, (240, 300), 70, 255, -1)
 
 
+def test_chessboard_in_a_shadow_is_calibrated():
+    view, image = shot(CHESS)
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    in_shadow = 1 / (1 + np.exp(((u - WIDTH / 2) / 2 + np.sqrt(3) / 2 * (v - HEIGHT / 2)) / 8))
+    calibration = calibrate_board([image * (1 - 0.6 * in_shadow)])
+    assert calibration.board == CHESS
+    assert off_mm(calibration, view).max() < 0.05
+
+
 @pytest.mark.parametrize(
     ("image", "board", "status"),
     [

@@ -105,18 +105,21 @@ def _calibrated(
         return calibrate_imaging_plane(pictures, unit_mm, named, lens), pictures[0].shape
     except CannotMeasure as answer:
         if answer.status != "no-target":
-            shown = "a picture in which the board is seen, flat and sharp"
-            raise InputError(images[0], "board", answer.reason, shown) from answer
+            shown = f"a picture in which the board is seen, flat and sharp. {answer.reason}"
+            raise InputError(images[0], "board", answer.status, shown) from answer
         typer.echo(f"{images[0]}: {answer}", err=True)
         raise typer.Exit(NOTHING_MEASURED) from answer
 
 
 def _show_target(found: PlaneCalibration, unit_mm: float) -> None:
-    """Print the target's three points as in a setup file."""
-    points = dict(zip(("origin_px", "x_axis_px", "z_axis_px"), found.points_px, strict=True))
+    """Print the target's three points as in a setup file.
+
+    Their ± are those of the map where the dots are: O′ itself is known better.
+    """
+    known = found.setup_uncertainty
     lengths = {"x_axis_mm": found.x_axis_mm, "z_axis_mm": found.z_axis_mm}
-    for (name, (u, v)), sigma in zip(points.items(), found.points_sigma_px, strict=True):
-        typer.echo(f"{name}  {u:.3f}, {v:.3f} ± {sigma:.3f} px")
+    for name, (u, v) in zip(("origin_px", "x_axis_px", "z_axis_px"), found.points_px, strict=True):
+        typer.echo(f"{name}  {u:.3f}, {v:.3f} ± {known[f'{name}_sigma']:.3f} px")
     for name, length in lengths.items():
         typer.echo(f"{name}  {length:.4f} mm")
     typer.echo(f"unit       {unit_mm:g} mm between flags (--unit-mm)")

@@ -39,6 +39,10 @@ REACH = 0.19
 LEAST_REAL = 0.6
 """Least share of the corners of a chessboard that look like corners."""
 
+GROWN_FROM = (3, 5, 7)
+"""Corners each way from which a chessboard is grown. The largest is it: in an uneven light or near
+a dark bench some do not grow to its rim."""
+
 SMALLEST_PX = 12.0
 """Smallest square whose corners are found, px."""
 
@@ -230,7 +234,8 @@ def _recognised(levels: FloatArray) -> Board:
     shown = [board for board in BOARDS.values() if _share(board, ids)]
     if shown:
         return max(shown, key=lambda board: _share(board, ids))
-    size = _chessboard_size(levels)
+    grid = _chessboard_grid(levels)
+    size = None if grid is None else (grid.shape[1], grid.shape[0])
     for board in BOARDS.values():
         if board.kind == "chessboard" and size == (board.columns - 1, board.rows - 1):
             # Boards with the same number of squares differ only in size, which the user supplies.
@@ -315,46 +320,46 @@ def _pitch_px(image_px: FloatArray) -> float:
 
 
 def _chessboard(levels: FloatArray, board: Board) -> BoardCorners:
-    size = (board.columns - 1, board.rows - 1)
-    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    seen = _chessboard_size(levels)
-    if seen is not None and sorted(seen) != sorted(size):
-        raise CannotMeasure(
-            "wrong-board",
-            f"{seen[0]} × {seen[1]} inner corners are seen where {board.name} has {size[0]} × "
-            f"{size[1]}: part of it is hidden or out of the picture, or it is another board.",
-        )
-    done, corners = cv2.findChessboardCornersSB(_stretched(levels), size, flags=flags)
-    if not done:
+    grid = _chessboard_grid(levels)
+    rows, columns = board.rows - 1, board.columns - 1
+    if grid is None:
         raise CannotMeasure(
             "no-board",
-            f"The {size[0]} × {size[1]} inner corners of {board.name} are not all seen. A "
+            f"The {columns} × {rows} inner corners of {board.name} are not all seen. A "
             "chessboard must be whole and have a white rim; of a ChArUco board a part is enough.",
         )
-    grid = np.asarray(corners, np.float64).reshape(board.rows - 1, board.columns - 1, 2)
-    # The detector does not determine the direction of the rows: the board is assumed upright.
-    if grid[:, -1, 0].mean() < grid[:, 0, 0].mean():
-        grid = grid[:, ::-1]
-    if grid[-1, :, 1].mean() < grid[0, :, 1].mean():
-        grid = grid[::-1]
-    return BoardCorners(board, np.arange(grid.shape[0] * grid.shape[1]), grid.reshape(-1, 2))
+    if grid.shape[:2] != (rows, columns):
+        raise CannotMeasure(
+            "wrong-board",
+            f"{grid.shape[1]} × {grid.shape[0]} inner corners are seen where {board.name} has "
+            f"{columns} × {rows}: part of it is hidden or out of the picture, it is turned, or it "
+            "is another board.",
+        )
+    return BoardCorners(board, np.arange(rows * columns), grid.reshape(-1, 2))
 
 
-def _chessboard_size(levels: FloatArray) -> tuple[int, int] | None:
-    """Number of inner corners along a row and a column of the chessboard; None if there is none."""
+def _chessboard_grid(levels: FloatArray) -> FloatArray | None:
+    """Inner corners of the chessboard, shape (rows, columns, 2), px; None if there is none."""
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
-    done, corners, meta = cv2.findChessboardCornersSBWithMeta(_stretched(levels), (3, 3), flags)
+    grey = _stretched(levels)
+    grids = [cv2.findChessboardCornersSBWithMeta(grey, (n, n), flags) for n in GROWN_FROM]
+    done, corners, meta = max(grids, key=lambda grid: np.size(grid[2]) if grid[0] else -1)
     if not done:
         return None
     # OpenCV also takes the dots of the laser pattern for corners.
     places = _fitted(levels, np.asarray(corners, np.float64).reshape(-1, 2))
     if sum(place is not None for place in places) < LEAST_REAL * len(places):
         return None
-    rows, columns = np.asarray(meta).shape[:2]
-    grid = np.asarray(corners, np.float64).reshape(rows, columns, 2)
+    grid = np.asarray(corners, np.float64).reshape(*np.shape(meta)[:2], 2)
     along_row, along_column = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    lies = abs(along_row[0]) * abs(along_column[1]) < abs(along_row[1]) * abs(along_column[0])
-    return (rows, columns) if lies else (columns, rows)
+    if abs(along_row[0]) * abs(along_column[1]) < abs(along_row[1]) * abs(along_column[0]):
+        grid = grid.swapaxes(0, 1)
+    # The detector does not determine the direction of the rows: the board is assumed upright.
+    if grid[:, -1, 0].mean() < grid[:, 0, 0].mean():
+        grid = grid[:, ::-1]
+    if grid[-1, :, 1].mean() < grid[0, :, 1].mean():
+        grid = grid[::-1]
+    return grid
 
 
 def _markers(grey: npt.NDArray[np.uint8], dictionary: str) -> IntArray:

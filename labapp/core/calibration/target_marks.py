@@ -134,7 +134,7 @@ def _filled(levels: EightBit, outside: EightBit) -> EightBit:
     return np.asarray(cv2.inpaint(levels, outside, 3.0, cv2.INPAINT_TELEA), np.uint8)
 
 
-def _around_plane(levels: EightBit, grey: FloatArray) -> EightBit:
+def _around_plane(levels: EightBit, grey: npt.NDArray[Any]) -> EightBit:
     """Return a mask of what is dark and runs out of the picture, with the blur of its edge."""
     _, dark = cv2.threshold(levels, 0, 1, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)
     if np.mean(grey[dark > 0]) > MOST_AROUND * np.mean(grey[dark == 0]):
