@@ -1003,6 +1003,16 @@ def test_wrong_board_is_rejected(labapp: Run, tmp_path: Path, board: str, field:
     assert f"{field}: " in stderr
 
 
+@pytest.mark.parametrize("option", ["--unit-mm", "--square-mm"])
+def test_length_of_another_target_is_rejected(labapp: Run, tmp_path: Path, option: str) -> None:
+    board = board_picture(tmp_path / "board.png", "charuco_4_inch")
+    picture = board if option == "--unit-mm" else SAMPLE / "calibration.png"
+    setup = tmp_path / "setup.toml"
+    code, stdout, stderr = labapp("calibrate", "plane", picture, option, 8.05, "--setup", setup)
+    assert (code, stdout, setup.exists()) == (2, "", False)
+    assert f"{option}: length: 8.05; " in stderr
+
+
 # --- help -------------------------------------------------------------------------------------
 
 

@@ -26,14 +26,14 @@ def calibrate_plane(
         ),
     ],
     unit_mm: Annotated[
-        float,
+        float | None,
         typer.Option(
             min=0.001,
             max=1000,
             help="Unit of the target's axes, the distance between flags of a bar (mm): measure it "
-            "on the print. It is 6.35 for labapp's printed target and its sample run.",
+            "on the print. Default: 6.35, as on labapp's printed target and in its sample run.",
         ),
-    ] = 6.35,
+    ] = None,
     board: Annotated[
         str | None,
         typer.Option(
@@ -54,13 +54,21 @@ def calibrate_plane(
     setup: SetupToChange = None,
 ) -> None:
     """Calibrate the imaging plane, and with a board the lens, from pictures (§5.1)."""
-    from labapp.core.calibration.plane_calibration import PlaneCalibration
+    from labapp.core.calibration.plane_calibration import UNIT_MM, PlaneCalibration
 
-    found, (height, width) = _calibrated(images, unit_mm, board, setup)
+    unit = UNIT_MM if unit_mm is None else unit_mm
+    found, (height, width) = _calibrated(images, unit, board, setup)
     if isinstance(found, PlaneCalibration):
-        _show_target(found, unit_mm)
-    elif square_mm is not None:
-        found = found.with_square(square_mm)
+        if square_mm is not None:
+            right = "--unit-mm, the unit of the axes: the picture shows the target, not a board"
+            raise InputError("--square-mm", "length", f"{square_mm:g}", right)
+        _show_target(found, unit)
+    else:
+        if unit_mm is not None:
+            right = f"--square-mm, the edge of a square: the picture shows {found.board.name}"
+            raise InputError("--unit-mm", "length", f"{unit_mm:g}", right)
+        if square_mm is not None:
+            found = found.with_square(square_mm)
     (x_scale, z_scale), angle = found.px_per_mm, found.angle_deg
     x_sigma, z_sigma, angle_sigma = found.scales_and_angle_sigma
     typer.echo(
