@@ -177,6 +177,12 @@ def test_target_beside_a_dark_bench_is_found(unit_px: float) -> None:
 
 
 @pytest.mark.slow
+def test_bench_beside_the_plane_does_not_move_the_marks() -> None:
+    scene = Scene(3.0, 16.0, (160.0, 400.0), light=150.0, dark=25.0, slope=0.6, bench=25.0)
+    assert np.abs(points(calibrate_plane(scene.render())) - scene.truth).max() < 0.12
+
+
+@pytest.mark.slow
 def test_small_picture_is_calibrated() -> None:
     scene = Scene(2.0, 10.0, (30.3, 180.7), (220, 200), light=90.0, noise=2.0)
     assert np.abs(points(calibrate_plane(scene.render())) - scene.truth).max() < 0.5

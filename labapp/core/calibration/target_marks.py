@@ -29,6 +29,12 @@ SPECK_FRACTION = 0.02
 MOST_AROUND = 0.7
 """What surrounds the plane in the picture is darker than this share of the plane's light."""
 
+LEAST_AROUND = 0.04
+"""A smaller share of the picture may be a bar that runs out of it."""
+
+DARKEST = 4
+"""Levels of 0 to 255 below this one are taken for equal."""
+
 MOST_ROLL_DEG = 30.0
 """Largest rotation of the bars from the horizontal and the vertical, degrees."""
 
@@ -95,9 +101,9 @@ def grey_levels(image: ColourOrGrey) -> FloatArray:
 def levelled(grey: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Background light of the plane, and the fraction missing at each pixel; both shaped as given.
 
-    The background is the median over a window of which any mark fills less than half. Where the
-    plane does not fill the picture, what is dark around it darkens the background of the marks near
-    its edge: a second pair is then without it.
+    The background is the median over a window of which any mark fills less than half. What is dark
+    around a plane that does not fill the picture would darken the background of the marks near its
+    edge: it is left out, and a second pair has it, as it may be a part of the plane.
     """
     height, width = grey.shape
     factor = max(2, max(height, width) // 160)
@@ -110,7 +116,7 @@ def levelled(grey: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
         return
     eight_bit = np.round((small - low) / (high - low) * 255.0).astype(np.uint8)
     around = _around_plane(eight_bit, small)
-    for outside in (None, around) if around.any() else (None,):
+    for outside in (around, None) if around.any() else (None,):
         plane = eight_bit if outside is None else _filled(eight_bit, outside)
         background = low + (high - low) / 255.0 * cv2.resize(
             _background(plane), (width, height), interpolation=cv2.INTER_LINEAR
@@ -136,12 +142,17 @@ def _filled(levels: EightBit, outside: EightBit) -> EightBit:
 
 def _around_plane(levels: EightBit, grey: npt.NDArray[Any]) -> EightBit:
     """Return a mask of what is dark and runs out of the picture, with the blur of its edge."""
-    _, dark = cv2.threshold(levels, 0, 1, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)
+    # Uneven light multiplies: the logarithms of plane and bench stay apart.
+    log = np.log(np.arange(256).clip(DARKEST) / DARKEST)
+    log_levels = np.round(log / log[-1] * 255.0).astype(np.uint8)[levels]
+    _, dark = cv2.threshold(log_levels, 0, 1, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)
     if np.mean(grey[dark > 0]) > MOST_AROUND * np.mean(grey[dark == 0]):
         return np.zeros_like(levels)
     _, labels = cv2.connectedComponents(np.asarray(dark, np.uint8), connectivity=4)
     at_edge = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     around = np.isin(labels, at_edge[at_edge > 0]).astype(np.uint8)
+    if np.mean(around) < LEAST_AROUND:
+        return np.zeros_like(levels)
     return np.asarray(cv2.dilate(around, np.ones((5, 5), np.uint8)), np.uint8)
 
 
