@@ -27,6 +27,20 @@ def save(path: Path, image: np.ndarray) -> Path:
     return path
 
 
+@pytest.mark.parametrize(("orientation", "quarter_turns"), [(1, 0), (3, 2), (6, 3), (8, 1)])
+def test_picture_is_turned_by_its_exif_data(
+    tmp_path: Path, orientation: int, quarter_turns: int
+) -> None:
+    """Like a video by its metadata: one of a calibration must match the other."""
+    tiff = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
+    exif = b"Exif\0\0" + tiff
+    jpeg = cv2.imencode(".jpg", GREY, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    path = tmp_path / "picture.jpg"
+    path.write_bytes(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:])
+    read = read_image(path).astype(int)
+    assert np.abs(read - np.rot90(GREY, quarter_turns)).max() <= 2
+
+
 @pytest.mark.parametrize(
     ("suffix", "levels"),
     [("png", 1), ("tiff", 1), ("bmp", 1), ("pgm", 1), ("png", 257), ("tiff", 257), ("pgm", 257)],

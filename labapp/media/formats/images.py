@@ -97,11 +97,15 @@ def read_image(path: Path) -> GreyImage:
 
 
 def decoded(content: bytes) -> npt.NDArray[Any] | None:
-    """Decode a picture; None if it is damaged or too large."""
+    """Decode a picture, turned upright by its EXIF data; None if it is damaged or too large.
+
+    Frames of a video are turned by their metadata, too: a picture that calibrates them must match.
+    """
     if not content or _is_cut_off(content):
         return None
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
     try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except (cv2.error, MemoryError):
         return None
     return image if image is not None and image.size else None
