@@ -10,6 +10,7 @@ import pytest
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.images.dots import Dots
 from labapp.core.matching import repair
 from labapp.core.matching.checks.rim_left_out import is_rim_left_out
 from labapp.core.matching.free_setup import FreeHypothesis
@@ -92,6 +93,19 @@ def test_false_dots_beyond_a_row_get_no_ray(monkeypatch: pytest.MonkeyPatch) -> 
     assert (repair.with_rim(observed, best).labels == labels).all()
 
 
+def test_rim_is_not_labelled_if_many_dots_would_still_have_no_ray(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(repair, "rim_evidence", lambda *_: 1000.0)
+    pool = Pool(Footprint(5.8, 3.2, 3.5), 0.2, fullness=0.8)
+    seen = see(pool, np.random.default_rng(1), sigma_px=0.05, false=12)
+    observed, labels = Observation.of(seen.dots, BENCH, FRAME_SHAPE), true_labels(seen)
+    best = evaluate(observed, without_ends(labels, rows=6))
+    assert best is not None
+    given = repair.with_rim(observed, best).labels
+    assert ((given == labels) | (given == UNLABELLED)).all()
+
+
 def test_ray_of_a_doubtful_label_is_not_dark_beside_a_continued_rim() -> None:
     pool = Pool(Footprint(5.8, 3.2, 3.5), 0.2, fullness=0.8)
     seen = see(pool, np.random.default_rng(1), sigma_px=0.05)
@@ -114,6 +128,29 @@ def test_rows_are_continued_over_several_dots() -> None:
     fewer = labels.copy()
     fewer[middle, np.flatnonzero(labels[middle] != UNLABELLED)[-2:]] = UNLABELLED
     assert (continued_labels(observed, fewer) == labels).all()
+
+
+def test_dot_beyond_a_missing_one_does_not_get_its_ray() -> None:
+    """The last dot but one of a row is missing: the last seems to continue the row in its place."""
+    seen = see(SMOOTH, np.random.default_rng(3), sigma_px=0.05)
+    labels = true_labels(seen)
+    row = labels.shape[0] // 2
+    ends = np.flatnonzero(labels[row] != UNLABELLED)[-3:]
+    fewer = labels.copy()
+    fewer[row, ends[1:]] = UNLABELLED
+    dots = np.delete(np.arange(len(seen.dots)), labels[row, ends[1]])
+    kept = Dots(*(values[dots] for values in vars(seen.dots).values()))
+    moved = np.searchsorted(dots, fewer)
+    fewer = np.where(fewer == UNLABELLED, UNLABELLED, moved)
+    observed = Observation.of(kept, BENCH, FRAME_SHAPE)
+    best = evaluate(observed, fewer)
+    assert best is not None
+    wider = evaluate(observed, continued_labels(observed, fewer))
+    assert wider is not None
+    new = (wider.labels != UNLABELLED) & (fewer == UNLABELLED)
+    given = repair._with_missing(observed, wider, new).labels
+    true = np.where(np.isin(labels, dots), np.searchsorted(dots, labels), UNLABELLED)
+    assert ((given == true) | (given == UNLABELLED)).all()
 
 
 @dataclass(frozen=True)

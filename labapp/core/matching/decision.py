@@ -135,7 +135,7 @@ def decide(
     best = _with_unknown(observed, best, ended.labels, fit_settings)
     best = with_rim(observed, best)
     all_labels = best.labels  # dots beyond a hidden row lose their rays, but were not left out
-    refuse_much_in_doubt(best)
+    refuse_much_in_doubt(best, ended.labels)
     _refuse_hidden_marker(observed, best)
     best = _without_rays(
         observed, best, rays_beside_hidden_rows(observed, best, fit_settings), fit_settings

@@ -13,17 +13,25 @@ from labapp.core.matching.checks.rim_left_out import (
     refuse_rim_left_out,
     rim_evidence,
 )
-from labapp.core.matching.checks.unexplained import explains, suffices
+from labapp.core.matching.checks.unexplained import explains, few_left, suffices
 from labapp.core.matching.hypothesis import (
     FINE_FIT,
     KNOT_ERROR_MM,
+    WEAK_NEIGHBOURS,
     Hypothesis,
     evaluate_averaged,
     grow_and_evaluate,
 )
-from labapp.core.matching.observation import UNLABELLED, Observation, widened, within_rings
+from labapp.core.matching.observation import (
+    UNLABELLED,
+    Observation,
+    neighbours_of,
+    widened,
+    within_rings,
+)
 from labapp.core.matching.prediction import (
     GATE_SIGMA2,
+    RIVAL_MARGIN,
     false_dot_deviance,
     pair_deviances,
     predict,
@@ -202,15 +210,51 @@ def _rows_begun(observed: Observation, hypothesis: Hypothesis) -> list[Hypothesi
     return found
 
 
+def _with_missing(observed: Observation, wider: Hypothesis, new: BoolArray) -> Hypothesis:
+    """Correct new labels that continue a row or column although the next dot is missing.
+
+    Such a dot is that of the ray after the next. It loses its label if it may be.
+
+    Parameters
+    ----------
+    observed
+        The dots.
+    wider
+        Hypothesis with the new labels.
+    new
+        Mask of these, shape (rows, columns).
+    """
+    rows, columns = new.shape
+    for i, j in np.argwhere(new).tolist():
+        for k, t in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+            before = (2 * i - k, 2 * j - t)
+            if not (0 <= k < rows and 0 <= t < columns and min(before) >= 0):
+                continue
+            if before[0] >= rows or before[1] >= columns or wider.labels[before] == UNLABELLED:
+                continue
+            if wider.labels[k, t] != UNLABELLED or observed.rays.absent[k, t]:
+                continue
+            labels = wider.labels.copy()
+            labels[k, t], labels[i, j] = labels[i, j], UNLABELLED
+            moved = evaluate_averaged(observed, labels, FINE_FIT, wider.pool)
+            if moved is not None and moved.cost < wider.cost + RIVAL_MARGIN:
+                labels[k, t] = UNLABELLED
+                wider = evaluate_averaged(observed, labels, FINE_FIT, wider.pool) or wider
+                break
+    return wider
+
+
 def with_rim(observed: Observation, best: Hypothesis) -> Hypothesis:
     """Label the dots of a steep rim, if this costs less than that they are false.
 
     The surface through the others is too smooth to predict them. Fine knots follow a steep rim.
+    Nothing is labelled if many dots would still have no ray: among false dots some continue rows.
 
     Raises
     ------
     CannotMeasure
-        ``no-match`` if it costs more, but only because the surface is rough.
+        ``no-match`` if it costs more, but only because the surface is rough; or if many of these
+        dots, or of the others, may be false.
     """
     evidence = rim_evidence(observed, best.labels)
     if evidence <= RIM_POSSIBLE:
@@ -220,9 +264,18 @@ def with_rim(observed: Observation, best: Hypothesis) -> Hypothesis:
     wider = evaluate_averaged(observed, labels, FINE_FIT, best.pool)
     if own is None or wider is None:
         return best
-    if wider.cost <= own.cost + 2 * evidence:
+    new = (best.labels == UNLABELLED) & (labels != UNLABELLED)
+    are_few = wider.stray_count <= few_left(observed)
+    if are_few and wider.cost <= own.cost + 2 * evidence:
+        wider = _with_missing(observed, wider, new)
+        if wider.stray_count:  # among false dots, one that stands alone may be false, too
+            alone = new & (neighbours_of(wider.labels != UNLABELLED) <= WEAK_NEIGHBOURS)
+            if np.count_nonzero(alone) > few_left(observed):
+                refuse_rim_left_out()
+            labels = np.where(alone, UNLABELLED, wider.labels)
+            wider = evaluate_averaged(observed, labels, FINE_FIT, wider.pool) or wider
         # A ray that lost its label as doubtful is not known to be dark.
-        unknown = (best.ray_states == 0) & (labels == UNLABELLED)
+        unknown = ((best.ray_states == 0) | new) & (wider.labels == UNLABELLED)
         return replace(wider, ray_states=np.where(unknown, 0, wider.ray_states))
     if wider.misfit < own.misfit:
         refuse_rim_left_out()

@@ -73,9 +73,14 @@ In 400 frames of pools of all kinds, measured correctly, it was at most 0.12; wi
 was 0.27, and the height was off by 5 σ."""
 
 
+def few_left(observed: Observation) -> float:
+    """Largest number of stray dots with which a hypothesis explains a frame."""
+    return max(2, FEW_LEFT * len(observed.plane_mm))
+
+
 def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
     """Whether there are few stray dots, few and isolated missed rays, and no dot at the marker."""
-    few = max(2, FEW_LEFT * len(observed.plane_mm))
+    few = few_left(observed)
     apart = _missed_lie_apart(hypothesis.labels, hypothesis.missed_rays)
     most = MOST_MISSED_APART * hypothesis.label_count if apart else 0.0
     missed = hypothesis.missed_count <= max(few, most)
@@ -129,13 +134,17 @@ def refuse_unexplained(
         raise CannotMeasure("no-match", NO_BOUNDARY)
 
 
-def refuse_much_in_doubt(best: Hypothesis) -> None:
-    """Raise ``no-match`` if so many labels were removed that the surface is not well known."""
-    if best.missed_count > MOST_IN_DOUBT * best.label_count:
+def refuse_much_in_doubt(best: Hypothesis, before: IntArray) -> None:
+    """Raise ``no-match`` if so many labels were removed that the surface is not well known.
+
+    ``before`` are the labels before, shape (rows, columns).
+    """
+    removed = int(np.count_nonzero((before != UNLABELLED) & (best.labels == UNLABELLED)))
+    if max(best.missed_count, removed) > MOST_IN_DOUBT * best.label_count:
         raise CannotMeasure(
             "no-match",
-            f"the best surface supports the rays of {best.label_count} dots only, and "
-            f"{best.missed_count} rays between them have no dot",
+            f"the best surface supports the rays of {best.label_count} dots only: those of "
+            f"{removed} others are in doubt, and {best.missed_count} rays between them have no dot",
         )
 
 
