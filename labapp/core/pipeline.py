@@ -28,6 +28,7 @@ from labapp.core.images.band_pass import quick_dots, tuned_dots
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.images.peaks import DetectorTuning
+from labapp.core.images.visibility import glare
 from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.frame import LineFrame, measure_lines
 from labapp.core.match import Candidate, Match, RowsOpen
@@ -189,7 +190,8 @@ def measure(
         None: the frame is measured independently.
     correction
         The operator's dots and rows, or lines, which are used instead of automatic detection; of
-        the image only the shape is then used. Ignored if it is for the other kind of pattern.
+        the image only the shape and the glare (`images.visibility.glare`) are then used. Ignored
+        if it is for the other kind of pattern.
     on_step
         Called when a step of an uncorrected frame is completed, with its name: ``dots``; with fit
         also ``surface``, when rays and surface are known, and ``measures``.
@@ -214,7 +216,8 @@ def measure(
         if isinstance(correction, Correction):
             dots, lattice = correction.dots, correction.lattice
             result = replace(result, dots=dots, lattice=lattice)
-            match, initial = match_corrected(dots, lattice, bench, frame_shape, match_settings)
+            observed = Observation.of(dots, bench, frame_shape, glare(image, dots))
+            match, initial = match_corrected(observed, lattice, match_settings)
             lattice = lattice_of_corrected(match, rig, lattice)
         elif prior is not None:
             from labapp.core.sequence.tracking import track
@@ -223,7 +226,7 @@ def measure(
                 dots = _dots_by_tuning(image, prior.tuning, settings.dots)
             result = replace(result, dots=dots)
             on_step("dots")
-            observed = Observation.of(dots, bench, frame_shape)
+            observed = Observation.of(dots, bench, frame_shape, glare(image, dots, prior.tuning))
             tracked = track(prior, observed, match_settings)
             match, previous = tracked.match, prior.carried_over()
             lattice = lattice_of_match(match, rig, len(dots))
@@ -233,7 +236,8 @@ def measure(
             found, no_rows = _lattice_or_why(dots, frame_shape, settings.lattice)
             numbered = found and number_on_plane(found, dots, bench.calibration)
             result = replace(result, dots=dots, lattice=numbered)
-            match, initial = _match_or_why(dots, found, no_rows, bench, frame_shape, match_settings)
+            observed = Observation.of(dots, bench, frame_shape, glare(image, dots, tuning))
+            match, initial = _match_or_why(observed, numbered, no_rows, match_settings)
             lattice = lattice_of_match(match, rig, len(dots))
         result = replace(result, match=match, lattice=lattice)
         if settings.scheme != "fit":
@@ -330,16 +334,14 @@ def _refused(result: Measurement, why: CannotMeasure) -> Measurement:
 
 
 def _match_or_why(
-    dots: Dots,
+    observed: Observation,
     lattice: Lattice | None,
     no_lattice: CannotMeasure | None,
-    bench: Bench,
-    frame_shape: tuple[int, int],
     settings: MatchSettings,
 ) -> tuple[Match, SplineSurface]:
     """Match the rays (`match_rays`); if nothing explains the dots, give the error of the rows."""
     try:
-        return match_rays(dots, lattice, bench, frame_shape, settings)
+        return match_rays(observed, lattice, settings)
     except CannotMeasure as why:
         nothing = why.reason == NOTHING_EXPLAINS
         raise (no_lattice if no_lattice and nothing else why) from None

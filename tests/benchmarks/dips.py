@@ -23,6 +23,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.matching.match_rays import match_rays
 from labapp.core.matching.match_settings import MatchSettings
+from labapp.core.matching.observation import Observation
 from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice
 from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
@@ -84,7 +85,8 @@ def matched(seen: SeenDots, rig: Rig = BENCH_RIG) -> Match:
         lattice = grow_lattice(seen.dots, GrowSettings())
     except CannotMeasure:
         lattice = None
-    return match_rays(seen.dots, lattice, Bench(rig, BENCH_VIEW), FRAME_SHAPE, MatchSettings())[0]
+    observed = Observation.of(seen.dots, Bench(rig, BENCH_VIEW), FRAME_SHAPE)
+    return match_rays(observed, lattice, MatchSettings())[0]
 
 
 def report(kind: str, results: list[PoolResult]) -> int:

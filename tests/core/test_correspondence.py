@@ -17,6 +17,7 @@ from labapp.core.matching import match_rays as match_rays_module
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.match_rays import lattice_of_match, match_rays
 from labapp.core.matching.match_settings import MatchSettings
+from labapp.core.matching.observation import Observation
 from labapp.core.rows.correction import (
     Correction,
     assign,
@@ -100,8 +101,8 @@ def matched(
     except CannotMeasure:
         lattice = None
     try:
-        context = Bench(rig, BENCH_VIEW), FRAME_SHAPE, settings or MatchSettings()
-        match, _ = match_rays(dots, lattice, *context)
+        observed = Observation.of(dots, Bench(rig, BENCH_VIEW), FRAME_SHAPE)
+        match, _ = match_rays(observed, lattice, settings or MatchSettings())
     except CannotMeasure as error:
         return None, error.status if error.reason else "no reason"
     return match, "ok"
@@ -355,8 +356,8 @@ def test_right_forced_correspondence_changes_nothing(pool: Pool, forced: Orienta
 
 
 def corrected(correction: Correction, settings: MatchSettings | None = None) -> Match:
-    context = Bench(BENCH_RIG, BENCH_VIEW), FRAME_SHAPE, settings or MatchSettings()
-    return match_corrected(correction.dots, correction.lattice, *context)[0]
+    observed = Observation.of(correction.dots, Bench(BENCH_RIG, BENCH_VIEW), FRAME_SHAPE)
+    return match_corrected(observed, correction.lattice, settings or MatchSettings())[0]
 
 
 def by_hand(seen: SeenDots, orientation: Orientation = "S/S") -> tuple[Correction, Site]:
@@ -541,8 +542,9 @@ def test_too_few_rows_or_wrong_orientation_is_rejected() -> None:
 def test_more_dots_than_any_match_can_explain_are_rejected_before_the_search() -> None:
     rng, rays = np.random.default_rng(3), BENCH_RIG.pattern.rows * BENCH_RIG.pattern.columns
     dots = as_dots(rng.uniform(0, FRAME_SHAPE[::-1], (int(1.4 * rays), 2)), 0.1)
+    observed = Observation.of(dots, Bench(BENCH_RIG, BENCH_VIEW), FRAME_SHAPE)
     with pytest.raises(CannotMeasure, match=f"too-many-dots: {len(dots)} spots .* {rays} dots"):
-        match_rays(dots, None, Bench(BENCH_RIG, BENCH_VIEW), FRAME_SHAPE, MatchSettings())
+        match_rays(observed, None, MatchSettings())
 
 
 def test_a_few_rows_around_the_reference_suffice() -> None:

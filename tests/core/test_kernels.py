@@ -592,7 +592,8 @@ def test_within_view_needs_all_corners_on_plane_and_image() -> None:
         pixel = np.stack([u / w, v / w], axis=1)
         expected &= ((corner > plane[0]) & (corner < plane[1])).all(axis=1)
         expected &= ((pixel > image[0]) & (pixel < image[1])).all(axis=1)
-    computed = match_kernels.within_view(places, margin, to_image, plane, image)
+    view = to_image, plane, image, np.zeros((0, 0), bool)
+    computed = match_kernels.within_view(places, margin, view)
     np.testing.assert_array_equal(computed, expected)
     assert 10 < computed.sum() < 190
 

@@ -304,5 +304,6 @@ def test_boundary_is_not_seen_where_dots_fade() -> None:
     bench = Bench(BENCH_RIG, BENCH_VIEW)
     lattice = find_lattice(fading, FRAME_SHAPE, LatticeSettings())
     for dots, is_seen in ((even, True), (fading, False)):
-        match, _ = match_rays(dots, lattice, bench, FRAME_SHAPE, MatchSettings())
+        observed = Observation.of(dots, bench, FRAME_SHAPE)
+        match, _ = match_rays(observed, lattice, MatchSettings())
         assert boundary_is_seen(match.ray_states) == is_seen

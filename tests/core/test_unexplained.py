@@ -85,7 +85,8 @@ def searched_with(seen: SeenDots, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     for name in ("_by_lattice", "_by_empty_sites", "_by_quadrics", "_by_caps"):
         noted(name)
     lattice = grow_lattice(seen.dots, GrowSettings())
-    match, _ = match_rays.match_rays(seen.dots, lattice, BENCH, FRAME_SHAPE, MatchSettings())
+    observed = Observation.of(seen.dots, BENCH, FRAME_SHAPE)
+    match, _ = match_rays.match_rays(observed, lattice, MatchSettings())
     assert (seen.ray[match.dot] == match.ray).all()
     return tried
 
@@ -209,10 +210,26 @@ def without_middle(rows: int) -> Hypothesis:
 
 
 def test_missed_rays_of_removed_labels_are_accepted_only_if_few() -> None:
-    unexplained.refuse_much_in_doubt(without_middle(rows=2))
+    few, many = without_middle(rows=2), without_middle(rows=4)
+    unexplained.refuse_much_in_doubt(few, few.labels)
     with pytest.raises(CannotMeasure) as caught:
-        unexplained.refuse_much_in_doubt(without_middle(rows=4))
+        unexplained.refuse_much_in_doubt(many, many.labels)
     assert caught.value.status == "no-match"
+
+
+def test_surface_is_refused_if_a_fifth_of_the_labels_was_removed() -> None:
+    seen = seen_with(false=0)
+    labels = true_labels(seen)
+    for columns, is_refused in ((1, False), (4, True)):
+        fewer = labels.copy()
+        fewer[:, np.flatnonzero((labels != UNLABELLED).any(axis=0))[:columns]] = UNLABELLED
+        found = hypothesis(seen, fewer)[1]
+        assert found.missed_count == 0
+        if is_refused:
+            with pytest.raises(CannotMeasure):
+                unexplained.refuse_much_in_doubt(found, labels)
+        else:
+            unexplained.refuse_much_in_doubt(found, labels)
 
 
 def test_surface_with_many_labels_removed_as_doubtful_is_refused(

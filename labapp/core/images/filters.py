@@ -8,7 +8,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from labapp.core.images.dots import Grey, Picture
+from labapp.core.images.dots import Grey, Image, Picture
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 NARROW, WIDE = 0.8, 1.6
@@ -23,6 +23,10 @@ SPIKE = 6.0
 DOUBTED, CERTAIN = 1.5, 6.0
 """Least ratio of a spike's fall of light to that of a dot: next to a certain spike or a suspect
 peak, and elsewhere. The latter is large since speckle makes dots much sharper than Gaussians."""
+
+SATURATED_AREA = 60.0
+"""Connected saturated pixels hide dots if their area is larger, in squared dot sizes; that of a
+saturated dot is a fifth of it."""
 
 ROUND_PX2 = 0.25
 """Variance that downsampling and upsampling add, px² of the downsampled picture."""
@@ -39,6 +43,30 @@ def noise_gain(size: float) -> float:
     a, b = (NARROW * size) ** 2, (WIDE * size) ** 2
     power = 1 / (4 * np.pi) * (1 / a + 1 / b - 4 / (a + b))
     return float(np.sqrt(power))
+
+
+def saturated_light(picture: Image, size: float) -> BoolArray | None:
+    """Return the pixels in saturated light larger than a dot, which hides dots; None if none is.
+
+    Parameters
+    ----------
+    picture
+        Grey levels, shape (height, width).
+    size
+        Dot size, px.
+
+    Returns
+    -------
+    BoolArray or None
+        Shape (height, width).
+    """
+    at_most, least = picture == picture.max(), SATURATED_AREA * size**2
+    if not least < np.count_nonzero(at_most) < at_most.size:  # a blank picture is not saturated
+        return None
+    _, part, found, _ = cv2.connectedComponentsWithStats(at_most.astype(np.uint8))
+    is_large = found[:, cv2.CC_STAT_AREA] > least
+    is_large[0] = False  # the other pixels
+    return np.asarray(is_large[part]) if is_large.any() else None
 
 
 _local = threading.local()

@@ -21,6 +21,7 @@ from labapp.core.images.filters import (
     kernel,
     pairs,
     peak_disc,
+    saturated_light,
     scratch,
     smaller_blurred,
     widen,
@@ -56,10 +57,9 @@ PROMINENT, PROMINENT_SHARE = 0.5, 0.2
 """A peak stands out from a ridge, such as the edge of a saturated spot, if its prominence exceeds
 these shares of the threshold or of its response: that of noise on the ridge is less than both."""
 
-SATURATED_AREA, SATURATED_SHARE, SATURATED_REACH = 60.0, 0.4, 3.0
-"""Saturated light is a connected area of saturated pixels larger than the first, in squared dot
-sizes; that of a saturated dot is a fifth of it. A peak is in it if so large a share of the pixels
-within the last, in dot sizes along either axis, are."""
+SATURATED_SHARE, SATURATED_REACH = 0.4, 3.0
+"""A peak is in saturated light if so large a share of the pixels within the second, in dot sizes
+along either axis, are."""
 
 PEAK_GAIN = 1 / (1 + NARROW**2) - 1 / (1 + WIDE**2)
 """Peak height of a Gaussian dot of the band's size after the band-pass, over its height before."""
@@ -191,17 +191,10 @@ class BandPassed:
 
     def _is_saturated(self, u: IntArray, v: IntArray) -> BoolArray:
         """Whether peaks are in saturated light, where dots are not seen."""
-        none, least = np.zeros(len(u), bool), SATURATED_AREA * self.size**2
-        at_most = self.picture == self.picture.max()
-        if np.count_nonzero(at_most) <= least:
-            return none
-        _, part, found, _ = cv2.connectedComponentsWithStats(at_most.astype(np.uint8))
-        is_large = found[:, cv2.CC_STAT_AREA] > least
-        is_large[0] = False  # the other pixels
-        if not is_large.any():
-            return none
+        if (saturated := saturated_light(self.picture, self.size)) is None:
+            return np.zeros(len(u), bool)
         side = 2 * round(SATURATED_REACH * self.size) + 1
-        share = cv2.blur(is_large[part].astype(np.float32), (side, side))
+        share = cv2.blur(saturated.astype(np.float32), (side, side))
         return np.asarray(share[v, u] > SATURATED_SHARE)
 
     def _without_broad(self, u: IntArray, v: IntArray, bright: FloatArray) -> FloatArray:

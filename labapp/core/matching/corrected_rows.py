@@ -11,9 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
-from labapp.core.images.dots import Dots
 from labapp.core.match import Match, Orientation, signs_of
 from labapp.core.matching.checks.unexplained import is_scattered
 from labapp.core.matching.hypothesis import WIDE_FIT, Hypothesis, evaluate, grow_and_evaluate
@@ -35,10 +33,8 @@ not fit."""
 
 
 def match_corrected(
-    dots: Dots,
+    observed: Observation,
     lattice: Lattice,
-    bench: Bench,
-    frame_shape: tuple[int, int],
     settings: MatchSettings,
 ) -> tuple[Match, SplineSurface]:
     """Determine the ray of every dot of a frame that the operator has corrected.
@@ -50,10 +46,10 @@ def match_corrected(
 
     Parameters
     ----------
-    dots, lattice
+    observed, lattice
         The corrected dots, and their rows and columns, 0 for none. Missing dots of blocked rows
         give no information about the boundary.
-    bench, frame_shape, settings
+    settings
         See `match_rays`.
 
     Raises
@@ -66,16 +62,15 @@ def match_corrected(
     orientations = settings.orientations
     reference = lattice.reference
     if reference is None:
-        match, near = match_rays(dots, rows if count else None, bench, frame_shape, settings)
+        match, near = match_rays(observed, rows if count else None, settings)
         if count == 0:
             return match, near
-        reference, orientations = _found_reference(match, rows, bench.rig), (match.orientation,)
+        reference, orientations = _found_reference(match, rows, observed.rig), (match.orientation,)
     elif count < LEAST_LABELS:
         raise CannotMeasure(
             "too-few-dots",
             f"only {count} dots have a row and a column; at least {LEAST_LABELS} are needed",
         )
-    observed = Observation.of(dots, bench, frame_shape)
     tried = (_bound(observed, lattice, reference, orientation) for orientation in orientations)
     bound = [b for b in tried if b is not None]
     if not bound:

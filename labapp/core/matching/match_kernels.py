@@ -7,6 +7,7 @@ from numba import types
 
 from labapp.core.compiled import compiled, inner
 from labapp.core.images.band_pass_kernels import next_apart, two_nearest
+from labapp.core.images.visibility import GLARE_CELL_PX, View
 from labapp.core.surface.kernels.ray_kernels import behind_torch, stopped_by_far_side
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
@@ -15,7 +16,8 @@ _dots = types.Tuple((_f2, _f1))  # type: ignore[no-untyped-call]
 _uncertain = types.Tuple((_f2, _f3))  # type: ignore[no-untyped-call]
 _i1, _i2 = (types.Array(types.int64, n, "A", readonly=True) for n in (1, 2))
 _mask = types.Array(types.boolean, 2, "A", readonly=True)
-_paths = _view = types.UniTuple(_f2, 3)  # type: ignore[no-untyped-call]
+_paths = types.UniTuple(_f2, 3)  # type: ignore[no-untyped-call]
+_view = types.Tuple((_f2, _f2, _f2, _mask))  # type: ignore[no-untyped-call]
 _surface = types.Tuple((_f2, _f1))  # type: ignore[no-untyped-call]
 
 
@@ -85,20 +87,13 @@ def left_out(
     return off, spread
 
 
-@compiled(_f2, _f2, _f2, _f2, _f2)
-def within_view(
-    places: FloatArray,
-    margin: FloatArray,
-    to_image: FloatArray,
-    plane: FloatArray,
-    image: FloatArray,
-) -> BoolArray:
-    """Whether n places on the plane are in view even if displaced by margins.
+@compiled(_f2, _f2, _view)
+def within_view(places: FloatArray, margin: FloatArray, view: View) -> BoolArray:
+    """Whether n places on the plane are in view (`Observation.view_with`) even if displaced.
 
-    Places and margins along either axis have shape (n, 2), mm; the homography from the plane to the
-    image shape (3, 3); the limits of the view on the plane and in the image, (low, high), shape
-    (2, 2).
+    Places and margins by which they are displaced along either axis have shape (n, 2), mm.
     """
+    to_image, plane, image, glare = view
     visible = np.ones(len(places), np.bool_)
     for k in range(len(places)):
         for corner in range(4):
@@ -109,6 +104,9 @@ def within_view(
             v = (to_image[1, 0] * x + to_image[1, 1] * z + to_image[1, 2]) / w
             visible[k] &= plane[0, 0] < x < plane[1, 0] and plane[0, 1] < z < plane[1, 1]
             visible[k] &= image[0, 0] < u < image[1, 0] and image[0, 1] < v < image[1, 1]
+            if visible[k] and glare.size:
+                row, column = (v - image[0, 1]) // GLARE_CELL_PX, (u - image[0, 0]) // GLARE_CELL_PX
+                visible[k] = not glare[int(row), int(column)]
     return visible
 
 
@@ -247,7 +245,7 @@ def classify_rays(
     paths: tuple[FloatArray, FloatArray, FloatArray],
     rays: FloatArray,
     dots: tuple[FloatArray, FloatArray],
-    view: tuple[FloatArray, FloatArray, FloatArray],
+    view: View,
     limits: FloatArray,
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Classify all R rays for a surface fitted to labels (`ray_classes.classify_rays`).
@@ -268,7 +266,7 @@ def classify_rays(
     dots
         Observed dots, shape (d, 2), mm, and `Observation.merged_reach_mm`, shape (d,).
     view
-        Homography and limits of the view, the last three arguments of `within_view`.
+        See `Observation.view_with`.
     limits
         Height of the tip of the electrode, distance below which dots merge, and distance from the
         edge of the view within which a predicted dot may be out of view, mm.
@@ -306,9 +304,9 @@ def classify_rays(
     # A stray dot near a prediction may be the dot of a ray that seems dark.
     outside &= (spacing >= resolution) & (two_nearest(shown, candidates)[0][:, 0] >= spacing)
     next_to_lit = outside & widened(is_lit, 1).ravel()[known]
-    next_to_lit &= within_view(shown, np.full_like(shown, near_edge), view[0], view[1], view[2])
+    next_to_lit &= within_view(shown, np.full_like(shown, near_edge), view)
     free &= ~stopped_by_far_side(surface, *known_paths, lit[known], next_to_lit)
-    seen = free & within_view(shown, np.zeros_like(shown), view[0], view[1], view[2])
+    seen = free & within_view(shown, np.zeros_like(shown), view)
 
     unlit = unlit[seen[unlit] & ~in_merged[unlit]]
     apart = two_nearest(shown[unlit], shown[among])[0][:, 1]

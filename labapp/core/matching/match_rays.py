@@ -22,9 +22,7 @@ from itertools import product
 
 import numpy as np
 
-from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
-from labapp.core.images.dots import Dots
 from labapp.core.match import (
     ORIENTATIONS,
     Candidate,
@@ -40,6 +38,7 @@ from labapp.core.matching.checks.unexplained import (
     MOST_SCATTERED,
     MOST_SCATTERED_AT_LAST,
     MOST_SCATTERED_OF_ALL,
+    NO_BOUNDARY,
     NOTHING_EXPLAINS,
     any_explains,
     explains_half,
@@ -74,11 +73,13 @@ from labapp.core.matching.observation import (
     LEAST_LABELS,
     UNLABELLED,
     Observation,
+    count_labels,
     try_fit,
 )
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import certain_states
 from labapp.core.matching.relabelling import (
+    BASES,
     extended_over_lattice,
     labels_from_lattice,
     reoriented_labels,
@@ -91,6 +92,9 @@ from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 MOST_SITES = 8
 """Maximum number of best-fitting sites of the marker in the lattice that become hypotheses."""
+
+FEW_GROWN = 0.92
+"""The labels of a lattice are evaluated as they are, too, if growth keeps less than this share."""
 
 MOST_REPAIRED = 4
 """Maximum number of hypotheses from caps that are repaired if none explains the frame."""
@@ -106,22 +110,18 @@ units of χ²."""
 
 
 def match_rays(
-    dots: Dots,
+    observed: Observation,
     lattice: Lattice | None,
-    bench: Bench,
-    frame_shape: tuple[int, int],
     settings: MatchSettings,
 ) -> tuple[Match, SplineSurface]:
     """Find the ray of every dot that has an unambiguous one, and the surface that explains them.
 
     Parameters
     ----------
-    dots, lattice
-        Dots of the frame, and their rows and columns; None if no lattice could be grown.
-    bench
-        The bench.
-    frame_shape
-        Height and width of the frame, px.
+    observed
+        The dots of the frame, and the bench.
+    lattice
+        Rows and columns of the dots; None if no lattice could be grown.
     settings
         See `MatchSettings`.
 
@@ -137,33 +137,36 @@ def match_rays(
         ``ambiguous-rows`` if several holes can be the absent dot, perhaps with a set-up that is
         wrong within its uncertainty. Other frames of the recording may decide between them.
     """
-    if len(dots) < LEAST_LABELS:
+    count, pattern = len(observed.plane_mm), observed.rig.pattern
+    if count < LEAST_LABELS:
         raise CannotMeasure(
-            "too-few-dots", f"only {len(dots)} dots found; at least {LEAST_LABELS} are needed"
+            "too-few-dots", f"only {count} dots found; at least {LEAST_LABELS} are needed"
         )
-    rays = bench.rig.pattern.rows * bench.rig.pattern.columns
-    if len(dots) > rays + max(MOST_SCATTERED_AT_LAST * rays, settings.most_strays(len(dots))):
+    rays = pattern.rows * pattern.columns
+    if count > rays + max(MOST_SCATTERED_AT_LAST * rays, settings.most_strays(count)):
         # No hypothesis would be accepted, after a search that takes minutes.
-        words = f"{len(dots)} spots stand out, where the lens makes {rays} dots at most"
+        words = f"{count} spots stand out, where the lens makes {rays} dots at most"
         raise CannotMeasure("too-many-dots", words)
-    if bench.rig.pattern.marker is None:
+    if pattern.marker is None:
         raise CannotMeasure("no-reference", "the pattern has no absent ray to identify the rows by")
-    observed = Observation.of(dots, bench, frame_shape)
     orientations = settings.orientations
     found: list[Hypothesis] = []
-    for first_labels in (_by_lattice, _by_empty_sites, _by_quadrics):
+    decided: tuple[Hypothesis, list[FreeHypothesis]] | None = None
+    for first_labels in (_by_lattice, _by_empty_sites, _by_quadrics, _by_turned_lattice):
         new = first_labels(observed, lattice, orientations)
         found = with_repaired(observed, found, new)
-        if any(suffices(observed, each) for each in found):
+        is_last = first_labels is _by_turned_lattice
+        # If no hypothesis explains most dots, caps are tried at once.
+        hopeless = bool(found) and not any(explains_half(observed, each) for each in found)
+        if hopeless or not (is_last or any(suffices(observed, each) for each in found)):
+            continue
+        try:
+            decided = _decide_among(observed, found, lattice, settings)
             break
-    # If no hypothesis explains most dots, caps are tried at once.
-    hopeless = bool(found) and not any(explains_half(observed, each) for each in found)
-    try:
-        decided = None if hopeless else _decide_among(observed, found, lattice, settings)
-    except CannotMeasure:
-        if any_explains(observed, found):
-            raise
-        decided = None
+        except CannotMeasure as refusal:
+            # Rows that contradict the boundary may be turned ones.
+            if any_explains(observed, found) and (is_last or refusal.reason != NO_BOUNDARY):
+                raise
     if decided is None or (decided[1] and not any_explains(observed, found)):
         decided = _decide_at_last(observed, found + _by_caps(observed), lattice, settings)
     best, open_holes = decided
@@ -322,7 +325,9 @@ def _by_lattice(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
     """Hypotheses from the lattice with the marker at each candidate site, in each orientation."""
-    return [] if lattice is None else _by_sites(observed, lattice, lattice.candidates, orientations)
+    if lattice is None:
+        return []
+    return _by_sites(observed, lattice, product(lattice.candidates, orientations, BASES))
 
 
 def _by_empty_sites(
@@ -333,18 +338,26 @@ def _by_empty_sites(
     Because of false or missing dots, or the torch, the marker may have fewer than three lit
     neighbours.
     """
-    return (
-        [] if lattice is None else _by_sites(observed, lattice, empty_sites(lattice), orientations)
-    )
+    if lattice is None:
+        return []
+    return _by_sites(observed, lattice, product(empty_sites(lattice), orientations, BASES[:1]))
+
+
+def _by_turned_lattice(
+    observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
+) -> list[Hypothesis]:
+    """As `_by_empty_sites`, with rows of the lattice that are not rows of the rays (`BASES`)."""
+    if lattice is None:
+        return []
+    return _by_sites(observed, lattice, product(empty_sites(lattice), orientations, BASES[1:]))
 
 
 def _by_sites(
     observed: Observation,
     lattice: Lattice,
-    sites: Iterable[Site],
-    orientations: tuple[Orientation, ...],
+    places: Iterable[tuple[Site, Orientation, IntArray]],
 ) -> list[Hypothesis]:
-    """Hypotheses from the lattice with the marker at given sites, in each orientation.
+    """Hypotheses from the lattice with the marker at given sites, in given orientations and bases.
 
     Only the best-fitting ones are grown. They are selected first by a quick fit, then by the fit
     with which labels grow.
@@ -353,16 +366,25 @@ def _by_sites(
     assert pattern.marker is not None
     shape = (pattern.rows, pattern.columns)
     labelled = [
-        labels_from_lattice(lattice, site, pattern.marker, orientation, shape)
-        for site, orientation in product(sites, orientations)
+        labels_from_lattice(lattice, site, pattern.marker, orientation, shape, basis)
+        for site, orientation, basis in places
     ]
     quick_mm = observed.quick_misfits(labelled)
     far_mm = QUICK_MISFIT_TIMES * quick_mm.min(initial=np.inf)
     likely = np.argsort(quick_mm, kind="stable")[: 2 * MOST_SITES]
     rough = _fitting(observed, [labelled[k] for k in likely if quick_mm[k] <= far_mm])[:MOST_SITES]
     most_mm = max(MISFIT_MM, MISFIT_TIMES * rough[0][0]) if rough else 0.0
-    scored = (grow_and_evaluate(observed, labels) for off_mm, labels in rough if off_mm < most_mm)
-    return [hypothesis for hypothesis in scored if hypothesis is not None]
+    found = []
+    for off_mm, labels in rough:
+        grown = grow_and_evaluate(observed, labels) if off_mm < most_mm else None
+        if grown is None:
+            continue
+        found.append(grown)
+        if grown.label_count < FEW_GROWN * count_labels(labels):
+            # Where rows lie close together, growth leaves many dots in doubt.
+            whole = evaluate(observed, labels)
+            found += [whole] if whole is not None and whole.cost < grown.cost else []
+    return found
 
 
 def _fitting(observed: Observation, labelled: list[IntArray]) -> list[tuple[float, IntArray]]:

@@ -19,7 +19,7 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.optics import ProjectedRays
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
-from labapp.core.images.visibility import over_limit
+from labapp.core.images.visibility import GLARE_CELL_PX, View, over_limit
 from labapp.core.match import MatchedDots
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool, misfits
 from labapp.core.values import (
@@ -87,6 +87,9 @@ class Observation(ReadOnlyArrays):
     over_limit
         Logarithm of the brightness of each over that of the faintest dot that is found
         (`images.visibility`), shape (n,). None: all dots are bright.
+    glare_px
+        Undistorted places of the frame where glare hides dots (`images.visibility`), shape (k, 2).
+        None: there are none.
     """
 
     plane_mm: FloatArray
@@ -96,10 +99,27 @@ class Observation(ReadOnlyArrays):
     frame_shape: tuple[int, int]
     hidden_rows: frozenset[int] = frozenset()
     over_limit: FloatArray | None = None
+    glare_px: FloatArray | None = None
 
     @classmethod
-    def of(cls, dots: Dots, bench: Bench, frame_shape: tuple[int, int]) -> Observation:
-        """Map the dots of a frame, of shape (height, width), px, to the imaging plane."""
+    def of(
+        cls,
+        dots: Dots,
+        bench: Bench,
+        frame_shape: tuple[int, int],
+        glare_px: FloatArray | None = None,
+    ) -> Observation:
+        """Map the dots of a frame to the imaging plane.
+
+        Parameters
+        ----------
+        dots, bench
+            The dots and the bench.
+        frame_shape
+            Height and width of the frame, px.
+        glare_px
+            Places of the frame where glare hides dots (`images.visibility.glare`), shape (k, 2).
+        """
         from labapp.core.images import band_pass_kernels
 
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
@@ -108,7 +128,17 @@ class Observation(ReadOnlyArrays):
             bench.calibration.matrix, image_px, sigma
         )
         size_mm = dots.size_px * scale
-        return cls(plane, covariance, size_mm, bench, frame_shape, over_limit=over_limit(dots))
+        if glare_px is not None and len(glare_px):
+            glare_px = bench.calibration.ideal_px(glare_px)
+        return cls(
+            plane,
+            covariance,
+            size_mm,
+            bench,
+            frame_shape,
+            over_limit=over_limit(dots),
+            glare_px=glare_px,
+        )
 
     @cached_property
     def resolution_mm(self) -> float:
@@ -245,7 +275,7 @@ class Observation(ReadOnlyArrays):
         self,
         plane_mm: FloatArray,
         margin_mm: FloatArray | float = 0.0,
-        view: tuple[FloatArray, FloatArray, FloatArray] | None = None,
+        view: View | None = None,
     ) -> BoolArray:
         """Whether dots at places on the plane, shape (…, 2), mm, would be visible.
 
@@ -256,15 +286,29 @@ class Observation(ReadOnlyArrays):
 
         places = plane_mm.reshape(-1, 2)
         margin = np.full(plane_mm.shape, margin_mm).reshape(-1, 2)
-        visible = match_kernels.within_view(places, margin, *(view or self.view))
+        visible = match_kernels.within_view(places, margin, view or self.view)
         return visible.reshape(plane_mm.shape[:-1])
 
     @cached_property
-    def view(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def view(self) -> View:
         """The view with all observed dots (`view_with`)."""
         return self.view_with(self.plane_mm)
 
-    def view_with(self, dots_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    @cached_property
+    def _glare(self) -> BoolArray:
+        """Cells of `GLARE_CELL_PX` of the view that glare hides, from its first px; or empty."""
+        if self.glare_px is None or len(self.glare_px) == 0:
+            return np.zeros((0, 0), bool)
+        first, last = (px.astype(float) for px in self.bench.frame_px(self.frame_shape))
+        counts = np.ceil((last - first) / GLARE_CELL_PX).astype(int) + 1
+        cells = ((self.glare_px - first - EDGE_PX) // GLARE_CELL_PX).astype(int)
+        cells = cells[((cells >= 0) & (cells < counts)).all(axis=1)]
+        hidden = np.zeros(counts[::-1], np.uint8)
+        hidden[cells[:, 1], cells[:, 0]] = 1
+        # The cells of the frame are not those of the view: without gaps between them.
+        return cv2.dilate(hidden, np.ones((3, 3), np.uint8)).astype(bool)
+
+    def view_with(self, dots_mm: FloatArray) -> View:
         """Limits of the view, given dots on the plane, shape (n, 2), n > 0, mm.
 
         The plane extends over its nominal size and over these dots, as O′ need not be exactly its
@@ -272,16 +316,17 @@ class Observation(ReadOnlyArrays):
 
         Returns
         -------
-        from_plane, on_plane_mm, in_image_px
+        from_plane, on_plane_mm, in_image_px, glare
             The homography from the plane to the image, shape (3, 3); the limits (low, high) of
-            visible dots, `EDGE_MM` and `EDGE_PX` inside the edges, shapes (2, 2).
+            visible dots, `EDGE_MM` and `EDGE_PX` inside the edges, shapes (2, 2); cells of
+            `GLARE_CELL_PX` of the image, from its lower limit, that glare hides, if any.
         """
         plane = self.rig.imaging_plane
         low = np.minimum(dots_mm.min(axis=0), 0.0) + EDGE_MM
         high = np.maximum(dots_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - EDGE_MM
         first, last = self.bench.frame_px(self.frame_shape)
         in_image = np.array([first + EDGE_PX, last - EDGE_PX])
-        return self.bench.calibration.from_plane, np.array([low, high]), in_image
+        return self.bench.calibration.from_plane, np.array([low, high]), in_image, self._glare
 
 
 def try_fit(

@@ -24,16 +24,39 @@ CLOSE_TOGETHER = 0.45
 distance of such dots in the frame. Elsewhere an exchange bends the surface too much."""
 
 
+BASES = np.array(
+    [
+        [[1, 0], [0, 1]],
+        [[0, 1], [1, 0]],
+        [[0, 1], [-1, 0]],
+        [[1, 0], [1, 1]],
+        [[1, 0], [-1, 1]],
+        [[1, 1], [0, 1]],
+        [[1, -1], [0, 1]],
+    ]
+)
+"""Row and column of the rays to which a step along the rows of a lattice, and along its columns,
+may lead: a twisted surface turns the rows, or the diagonals of the pattern become the shortest
+steps between dots."""
+
+
 def labels_from_lattice(
-    lattice: Lattice, hole: Site, ray: Site, orientation: Orientation, shape: tuple[int, int]
+    lattice: Lattice,
+    hole: Site,
+    ray: Site,
+    orientation: Orientation,
+    shape: tuple[int, int],
+    basis: IntArray = BASES[0],
 ) -> IntArray:
     """Label a complete lattice, given the site (k, t) of the hole and its absent ray (i, j).
 
-    Labels have the pattern's shape (rows, columns); dots at sites beyond it get no ray.
+    Labels have the pattern's shape (rows, columns); dots at sites beyond it get no ray. ``basis``
+    is one of `BASES`.
     """
     dot = np.nonzero(lattice.row > 0)[0]
     site = np.stack([lattice.row[dot], lattice.column[dot]], axis=-1)
-    return _labels_of_pairs(np.array(ray) + (site - hole) * signs_of(orientation), dot, shape)
+    steps = (site - hole) @ basis * signs_of(orientation)
+    return _labels_of_pairs(np.array(ray) + steps, dot, shape)
 
 
 def extended_over_lattice(
