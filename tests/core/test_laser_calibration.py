@@ -169,3 +169,14 @@ def test_nearly_perpendicular_beam_gives_a_warning() -> None:
     calibration = calibrate_laser(5.0, 5.0, 5.03)
     assert calibration.angle_deg == pytest.approx(90.0)
     assert "l3_mm" in calibration.warnings[0]
+
+
+@pytest.mark.parametrize(("apart_mm", "is_doubtful"), [(0.5, False), (2.0, True)])
+def test_readings_far_apart_are_a_warning(apart_mm: float, is_doubtful: bool) -> None:
+    """Their large ± would otherwise let any lengths agree."""
+    l1, l2, l3 = 5.0, 5.6, 5.2
+    l1_readings = [l1 - apart_mm / 2, l1, l1 + apart_mm / 2]
+    warnings = calibrate_laser(l1_readings, [l2] * 3, [l3] * 3).warnings
+    assert any("l1_mm" in words and f"{apart_mm:.2g} mm" in words for words in warnings) == (
+        is_doubtful
+    )

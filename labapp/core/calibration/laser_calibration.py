@@ -36,6 +36,10 @@ DOUBT_SIGMA, REFUSE_SIGMA, REFUSE_FRACTION = 2.0, 4.0, 0.05
 """Lengths that disagree by more standard uncertainties than the first cause a warning; by more than
 the second, and by more than this fraction of the length, they are refused."""
 
+READINGS_APART = 6.0
+"""Readings of a length that are farther apart than this many standard deviations of a reading cause
+a warning. One set of ten correct readings in a thousand scatters so much."""
+
 
 @dataclass(frozen=True)
 class LaserCalibration:
@@ -156,6 +160,13 @@ def calibrate_laser(
         if once
         else []
     )
+    for name, readings in zip(names, (l1_mm, l2_mm, l3_mm), strict=True):
+        low, high = float(np.min(readings)), float(np.max(readings))
+        if high - low > READINGS_APART * settings.reading_sigma_mm:
+            warnings.append(
+                f"The readings of {name} are {high - low:.2g} mm apart ({low:g} to {high:g}): one "
+                "of them may be wrong. Their scatter makes every ± larger."
+            )
     for name, length in (("l1_mm", l1), ("l3_mm", l3)):
         apart = float(np.hypot(length.expanded, l2.expanded))
         _check_order(name, length.mean_mm, l2.mean_mm, apart, warnings)
