@@ -216,7 +216,7 @@ def measure(
         if isinstance(correction, Correction):
             dots, lattice = correction.dots, correction.lattice
             result = replace(result, dots=dots, lattice=lattice)
-            observed = Observation.of(dots, bench, frame_shape, glare(image, dots))
+            observed = _observed(image, dots, bench, None)
             match, initial = match_corrected(observed, lattice, match_settings)
             lattice = lattice_of_corrected(match, rig, lattice)
         elif prior is not None:
@@ -226,8 +226,7 @@ def measure(
                 dots = _dots_by_tuning(image, prior.tuning, settings.dots)
             result = replace(result, dots=dots)
             on_step("dots")
-            observed = Observation.of(dots, bench, frame_shape, glare(image, dots, prior.tuning))
-            tracked = track(prior, observed, match_settings)
+            tracked = track(prior, _observed(image, dots, bench, prior.tuning), match_settings)
             match, previous = tracked.match, prior.carried_over()
             lattice = lattice_of_match(match, rig, len(dots))
         else:
@@ -236,7 +235,7 @@ def measure(
             found, no_rows = _lattice_or_why(dots, frame_shape, settings.lattice)
             numbered = found and number_on_plane(found, dots, bench.calibration)
             result = replace(result, dots=dots, lattice=numbered)
-            observed = Observation.of(dots, bench, frame_shape, glare(image, dots, tuning))
+            observed = _observed(image, dots, bench, tuning)
             match, initial = _match_or_why(observed, numbered, no_rows, match_settings)
             lattice = lattice_of_match(match, rig, len(dots))
         result = replace(result, match=match, lattice=lattice)
@@ -256,6 +255,12 @@ def measure(
     if tuning is None:
         return result, None
     return result, Prior.of(bench, tuning, match, pool, reconstruction, measured)
+
+
+def _observed(image: Image, dots: Dots, bench: Bench, tuning: DetectorTuning | None) -> Observation:
+    """The dots on the imaging plane, and where the frame hides others."""
+    shape = image.shape[0], image.shape[1]
+    return Observation.of(dots, bench, shape, glare(image, dots, tuning))
 
 
 def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) -> Measurement:

@@ -58,17 +58,11 @@ def calibrate_plane(
 
     unit = UNIT_MM if unit_mm is None else unit_mm
     found, (height, width) = _calibrated(images, unit, board, setup)
+    _refuse_other_length(found, unit_mm, square_mm)
     if isinstance(found, PlaneCalibration):
-        if square_mm is not None:
-            right = "--unit-mm, the unit of the axes: the picture shows the target, not a board"
-            raise InputError("--square-mm", "length", f"{square_mm:g}", right)
         _show_target(found, unit)
-    else:
-        if unit_mm is not None:
-            right = f"--square-mm, the edge of a square: the picture shows {found.board.name}"
-            raise InputError("--unit-mm", "length", f"{unit_mm:g}", right)
-        if square_mm is not None:
-            found = found.with_square(square_mm)
+    elif square_mm is not None:
+        found = found.with_square(square_mm)
     (x_scale, z_scale), angle = found.px_per_mm, found.angle_deg
     x_sigma, z_sigma, angle_sigma = found.scales_and_angle_sigma
     typer.echo(
@@ -117,6 +111,21 @@ def _calibrated(
             raise InputError(images[0], "board", answer.status, shown) from answer
         typer.echo(f"{images[0]}: {answer}", err=True)
         raise typer.Exit(NOTHING_MEASURED) from answer
+
+
+def _refuse_other_length(
+    found: Calibration, unit_mm: float | None, square_mm: float | None
+) -> None:
+    """Raise `InputError` if the length given is not of what the picture shows."""
+    from labapp.core.calibration.plane_calibration import PlaneCalibration
+
+    if isinstance(found, PlaneCalibration):
+        if square_mm is not None:
+            right = "--unit-mm, the unit of the axes: the picture shows the target, not a board"
+            raise InputError("--square-mm", "length", f"{square_mm:g}", right)
+    elif unit_mm is not None:
+        right = f"--square-mm, the edge of a square: the picture shows {found.board.name}"
+        raise InputError("--unit-mm", "length", f"{unit_mm:g}", right)
 
 
 def _show_target(found: PlaneCalibration, unit_mm: float) -> None:

@@ -110,18 +110,14 @@ units of χ²."""
 
 
 def match_rays(
-    observed: Observation,
-    lattice: Lattice | None,
-    settings: MatchSettings,
+    observed: Observation, lattice: Lattice | None, settings: MatchSettings
 ) -> tuple[Match, SplineSurface]:
     """Find the ray of every dot that has an unambiguous one, and the surface that explains them.
 
     Parameters
     ----------
-    observed
-        The dots of the frame, and the bench.
-    lattice
-        Rows and columns of the dots; None if no lattice could be grown.
+    observed, lattice
+        Dots of the frame, and their rows and columns; None if no lattice could be grown.
     settings
         See `MatchSettings`.
 
@@ -149,11 +145,10 @@ def match_rays(
         raise CannotMeasure("too-many-dots", words)
     if pattern.marker is None:
         raise CannotMeasure("no-reference", "the pattern has no absent ray to identify the rows by")
-    orientations = settings.orientations
     found: list[Hypothesis] = []
     decided: tuple[Hypothesis, list[FreeHypothesis]] | None = None
     for first_labels in (_by_lattice, _by_empty_sites, _by_quadrics, _by_turned_lattice):
-        new = first_labels(observed, lattice, orientations)
+        new = first_labels(observed, lattice, settings.orientations)
         found = with_repaired(observed, found, new)
         is_last = first_labels is _by_turned_lattice
         # If no hypothesis explains most dots, caps are tried at once.
@@ -353,9 +348,7 @@ def _by_turned_lattice(
 
 
 def _by_sites(
-    observed: Observation,
-    lattice: Lattice,
-    places: Iterable[tuple[Site, Orientation, IntArray]],
+    observed: Observation, lattice: Lattice, places: Iterable[tuple[Site, Orientation, IntArray]]
 ) -> list[Hypothesis]:
     """Hypotheses from the lattice with the marker at given sites, in given orientations and bases.
 
