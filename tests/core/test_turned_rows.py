@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from labapp.core.images.dots import Dots
 from labapp.core.matching import match_rays
 from labapp.core.matching.relabelling import BASES, labels_from_lattice
 from labapp.core.rows.lattice import Lattice, lattice_of_dots
-from labapp.core.rows.lattice_growth import grow_lattice
+from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice
 from labapp.core.values import IntArray
 from labapp.simulation.pools import egg
 from tests.benchmarks.dips import matched, measure_pool
@@ -45,8 +46,8 @@ def test_turned_lattice_is_matched_at_once(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(match.dot) > 0.95 * len(seen.ray)
 
 
-def turned_lattice(*given: object) -> Lattice:
+def turned_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
     """Return the lattice with rows and columns exchanged."""
-    found = grow_lattice(*given)  # type: ignore[arg-type]
+    found = grow_lattice(dots, settings)
     candidates = tuple((t, k) for k, t in found.candidates)
     return Lattice(found.column, found.row, None, candidates)
